@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -64,6 +65,25 @@ def test_each_keeps_the_contract(name: str) -> None:
     drawn = first.pictures[:, 0, 0].reshape(*real.shape, -1).mean(axis=-1)
     mirrored = [real, real.swapaxes(1, 2), real[:, ::-1], real[:, :, ::-1]]
     assert np.argmin([np.abs(drawn - each).mean() for each in mirrored]) == 0, "a picture stands upright"
+
+
+@pytest.mark.parametrize("name", LEARNED)
+def test_rewards_are_in_the_unit_of_the_data(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Data in which every macro-action costs 4, and none ends an episode, teach that within sixty updates."""
+    monkeypatch.setattr(latent, "UPDATES", 60)
+    monkeypatch.setattr(convolutional, "_STEPS", 60)
+    few = data().first(60)
+    never = np.zeros_like(few.terminated)
+    cut = few.terminated | few.truncated
+    lost = np.zeros_like(few.success)
+    costly = replace(few, rewards=np.full_like(few.rewards, -4.0), terminated=never, truncated=cut, success=lost)
+    found = imagined(fitted(name, costly))
+    if name == "copy":
+        assert found.rewards is found.p_ended is None, "it says nothing of them"
+    else:
+        assert found.rewards is not None and found.p_ended is not None
+        assert -8.0 < found.rewards.mean() < -2.0
+        assert found.p_ended.max() < 0.05
 
 
 @pytest.mark.usefixtures("quick")

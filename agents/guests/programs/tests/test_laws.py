@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -149,6 +149,34 @@ def test_a_factor_that_changes_whatever_is_done_drifts() -> None:
     assert laws.drifts == {0: pytest.approx(0.2)} and not any(laws.effects)
     assert laws.superfluous == {0}
     assert sum(each.probability for each in laws.outcomes((0,), 1)) == pytest.approx(1.0)
+
+
+USES: dict[str, Callable[[State, State], bool] | None] = {
+    "no law": lambda now, then: then[0] == 0,
+    "a symbol after": lambda now, then: then[1] == 1,
+    "a symbol before": lambda now, then: now[1] == 1,
+    "two symbols that are alike": lambda now, then: then[0] == then[1],
+    "an effect": None,
+}
+"""Where laws use a factor that drifts: by which symbols there is a reward, or in an effect instead."""
+
+
+@pytest.mark.parametrize("used", USES)
+def test_a_factor_on_which_a_law_depends_is_not_superfluous(used: str) -> None:
+    rewarded = USES[used]
+    rng = np.random.default_rng(0)
+    rows = []
+    for _ in range(300):
+        now = (int(rng.integers(3)), int(rng.integers(3)))
+        drifted = (now[1] + int(rng.random() < 0.3) * int(rng.integers(1, 3))) % 3
+        turns = rewarded is not None or now[1] == 2
+        then = ((now[0] + int(turns)) % 3, drifted)
+        rows.append(row(now, then, reward=float(rewarded is not None and rewarded(now, then))))
+    laws = Laws((3, 3), 1, rows)
+    assert laws.drifts.keys() == {1}
+    assert all(laws.end(each.now, 0, each.then).reward == each.reward for each in rows)
+    assert all(laws.turned(each.now, 0)[0] == each.then[0] for each in rows)
+    assert laws.superfluous == ({1} if used == "no law" else set())
 
 
 def test_ends_say_two_equal_values_in_one_condition() -> None:
