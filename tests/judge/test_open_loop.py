@@ -110,20 +110,29 @@ class Perfect(bench_fakes.RulesImaginer):
         start = alike[int(rng.integers(len(alike)))]
         looks = (self.env.reset(seed=int(rng.integers(2**31)), options={"macrostate": start})[1] for _ in range(100))
         next(info for info in looks if np.array_equal(info.get("shown", info["macrostate"]), seen))
-        infos = [self.env.step(action)[4] for action in actions]
-        read = [self.spec.as_observed(info.get("shown", info["macrostate"])) for info in infos]
+        steps = [self.env.step(action) for action in actions]
+        read = [self.spec.as_observed(info.get("shown", info["macrostate"])) for *_, info in steps]
         rollout = super().imagine(frame, actions=actions, depth=depth, rng=rng)
-        return dataclasses.replace(rollout, macrostates=np.array(read))
+        rewards, ended = (np.array([float(step[part]) for step in steps]) for part in (1, 2))
+        return dataclasses.replace(rollout, macrostates=np.array(read), rewards=rewards, p_terminated=ended)
 
 
 @pytest.mark.parametrize(
     ("task", "depth"),
-    [("pick_place:gesture=first", 1), ("arrows:cubes=2,gesture=0.5,lag=2", 4), ("arrows:cubes=2,gesture=0.0", 4)],
+    [
+        ("pick_place:gesture=first", 1),
+        ("pick_place:lag=1", 1),
+        ("arrows:cubes=2,gesture=0.5,lag=2", 4),
+        ("arrows:cubes=2,gesture=0.0", 4),
+    ],
 )
 def test_who_imagines_what_frames_will_show_is_right(task: str, depth: int) -> None:
+    """Rewards and ends are those of the latest macro-action, however old the frame is."""
     spec = labelled(task)
     agent, found = Perfect(spec), asked(spec, 6, 4)
-    assert open_loop(agent, found, SeedTree(0)).correct.tolist() == [1.0] * depth
+    loop = open_loop(agent, found, SeedTree(0))
+    assert (loop.correct.tolist(), loop.reward_mae.tolist()) == ([1.0] * depth, [0.0] * depth)
+    assert loop.termination_error.tolist() == [0.0] * depth
 
 
 def test_examples_and_samples_go_as_imagined() -> None:

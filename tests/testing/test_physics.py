@@ -1,6 +1,7 @@
 """``check --physics``: fidelity and margins of any task, and refusals."""
 
 import json
+from contextlib import suppress
 from types import SimpleNamespace
 
 import pytest
@@ -86,6 +87,34 @@ def test_every_appearance_decides_a_check_of_continuous_control(worst, passes, m
     monkeypatch.setattr(physics, "motion", SimpleNamespace(certificate=exact_facts, evidence=str, chance=str))
     wanted = {"turns": 0, "trials": 1, "random_episodes": 0, "appearances": ("clean", "mild")}
     assert physics.check_motion("ArrowPuzzleEasyMotion", tmp_path / "x.json", **wanted) is passes
+
+
+def test_random_episodes_add_up_over_blocks_and_calls(monkeypatch, tmp_path):
+    """And over one that is killed in the middle of a block: each seed counts once."""
+    out = tmp_path / "kept.json"
+    none = {"random_episodes": 0, "random_solved": 0, "faults": {}}
+    out.write_text(json.dumps({"task": "arrow_puzzle_easy", "appearances": {"clean": none, "mild": none}}))
+    exact_facts = SimpleNamespace(as_ruled=1, segments=1, shown=1.0)
+    stand_in = SimpleNamespace(certificate=lambda spec, kept: exact_facts, evidence=str, chance=str)
+    monkeypatch.setattr(physics, "motion", stand_in)
+    monkeypatch.setattr(physics, "_BLOCK", 3)
+    killed_at = [9]
+
+    def random_episode(env, seed):
+        if seed in killed_at:
+            raise KeyboardInterrupt(killed_at.clear())
+        return seed in (1, 2, 4, 5, 9)
+
+    monkeypatch.setattr("imagine_bench.tasks.continuous.segments.random_episode", random_episode)
+    wanted = {"turns": 0, "trials": 0, "appearances": ("clean",)}
+    counted = []
+    for until in (5, 11, 11, 11):
+        with suppress(KeyboardInterrupt):
+            physics.check_motion("ArrowPuzzleEasyMotion", out, random_episodes=until, **wanted)
+        kept = json.loads(out.read_text())["appearances"]
+        counted.append((kept["clean"]["random_episodes"], kept["clean"]["random_solved"]))
+        assert kept["mild"] == none
+    assert counted == [(5, 3), (8, 4), (11, 5), (11, 5)]
 
 
 def test_a_task_without_targets_is_only_measured():
