@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import time
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 from small_runs import small
 
+from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ArtefactError, BusyError
 from imagine_bench.running.bench import load_bench
@@ -111,3 +113,16 @@ def test_the_newest_bench_or_recording_of_some_tasks_or_of_all(tmp_path: Path) -
         newest.unlink()
     with pytest.raises(ArtefactError, match=r"no recording of arrow_puzzle below .*--task arrow_puzzle'"):
         newest_recording(tmp_path, "arrow_puzzle")
+
+
+def test_the_newest_of_a_task_is_of_none_whose_name_begins_alike(tmp_path: Path) -> None:
+    tasks = sorted(registry.TASKS)  # a name before those that begin with it
+    assert any(later.startswith(earlier) for earlier, later in itertools.pairwise(tasks))
+    kept = {task: tmp_path / task / "quick-0123456789ab" for task in tasks}
+    for time_s, folder in enumerate(kept.values()):
+        for path in (folder / "sessions.json", folder / "imagine/seed_0/recording.rrd"):
+            make_folder(path.parent)
+            path.touch()
+            os.utime(path, (time_s, time_s))
+    assert {task: newest_bench(tmp_path, task) for task in tasks} == kept
+    assert {task: newest_recording(tmp_path, task).parents[2] for task in tasks} == kept
