@@ -51,6 +51,7 @@ class CodeByValue:
     name: str  #: its qualified name
     pickled: bytes = field(compare=False)  #: the bytes of :mod:`cloudpickle`, each time others
     digest: str  #: twelve hex digits, see :func:`code_digest`
+    module: str = field(default="", compare=False)  #: its module where that is of an installed package
 
     @classmethod
     def of(cls, target: Callable[..., Any]) -> CodeByValue:
@@ -71,7 +72,8 @@ class CodeByValue:
                 f"{name} cannot be sent to worker processes ({type(error).__name__}: {why}). Let it make such objects "
                 "itself, in its constructor, and keep them out of variables around it."
             ) from error
-        return cls(name, pickled, code_digest(target))
+        module = str(getattr(target, "__module__", ""))
+        return cls(name, pickled, code_digest(target), module if _is_of_package(module) else "")
 
     def __str__(self) -> str:
         return f"the code of {self.name}"
@@ -185,8 +187,11 @@ def _is_installed(module: str | None) -> bool:
     if module is None or module == "__main__":
         return False
     top = module.partition(".")[0]
-    if top == "imagine_bench" or top in sys.stdlib_module_names:
-        return True
+    return top == "imagine_bench" or top in sys.stdlib_module_names or _is_of_package(module)
+
+
+def _is_of_package(module: str) -> bool:
+    """Whether a module lies where packages are installed."""
     file = getattr(sys.modules.get(module), "__file__", None)
     return file is not None and any(folder in Path(file).parts for folder in _INSTALLED)
 

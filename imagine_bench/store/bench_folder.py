@@ -157,7 +157,8 @@ def as_begun(root: Path, protocol: P) -> P:
     Such a bench goes on, unless its first session names another version of one of these packages.
     """
     places = protocol.code_places()
-    former = dataclasses.replace(protocol, code=tuple(pair for pair in protocol.code if pair[0] not in places))
+    of_classes = tuple((name, found[:12]) for name, found in protocol.code if name not in places)
+    former = dataclasses.replace(protocol, code=of_classes)
     folder = bench_folder(root, former)
     if former == protocol or bench_folder(root, protocol).exists() or not (folder / _SESSIONS).exists():
         return protocol

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ from imagine_bench.judge.verify import verify_runs
 from imagine_bench.protocols import data
 from imagine_bench.protocols.control import protocol
 from imagine_bench.registry.builtin import OUR_AGENTS
+from imagine_bench.registry.by_value import CodeByValue
 from imagine_bench.regression.protocol import plan as plan_regression
 from imagine_bench.running.trained import load_trained
 from imagine_bench.store.bench_folder import read_control
@@ -90,6 +93,30 @@ def test_an_agent_of_changed_code_is_not_taken_up(module: Path, bench: Bench) ->
     with pytest.raises(ArtefactError, match=r"code of agent theirs is not that of this bench .* bring the"):
         load_trained(run)
     assert load_trained(run.parent.parent / "random/seed_0")
+
+
+def test_a_class_of_an_installed_package_has_the_digest_of_that_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    guests = Guests(tmp_path / "site-packages", monkeypatch)
+    module = guests.new("agent", "theirs") / "src/theirs.py"
+    agent = import_module("theirs").Theirs
+    of = CodeByValue.of
+    run = imagine_bench.bench("arrow_puzzle", agents=[agent], out=tmp_path, **_OPTIONS).folder / "Theirs/seed_0"
+    assert load_trained(run).episodes == 2
+    with monkeypatch.context() as earlier:
+        earlier.setattr(CodeByValue, "of", classmethod(lambda cls, made: dataclasses.replace(of(made), module="")))
+        before = imagine_bench.bench("arrow_puzzle", agents=[agent], out=tmp_path / "before", **_OPTIONS).folder
+    again = imagine_bench.bench("arrow_puzzle", agents=[agent], out=tmp_path / "before", **_OPTIONS).folder
+    assert again == before, "a bench of before classes had the digests of packages"
+    assert load_trained(before / "Theirs/seed_0").episodes == 2
+    edit(module)
+    other = imagine_bench.bench("arrow_puzzle", agents=[agent], out=tmp_path, **_OPTIONS).folder
+    assert other != run.parent.parent
+    with pytest.raises(ArtefactError, match="code of agent Theirs is not that of this bench"):
+        load_trained(run)
+    del registry.AGENTS["Theirs"]
+    guests.forget()
 
 
 @pytest.fixture
