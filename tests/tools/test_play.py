@@ -68,7 +68,7 @@ def test_keys_do_what_the_environment_does():
     plain.close()
 
 
-def test_the_model_imagines_from_the_first_frame_by_the_same_keys(monkeypatch):
+def test_the_model_imagines_from_the_first_frame_by_the_same_keys():
     asked = []
 
     class Imaginer(FakeImaginer):
@@ -78,7 +78,6 @@ def test_the_model_imagines_from_the_first_frame_by_the_same_keys(monkeypatch):
             right = registry.task("arrow_puzzle").rules.outcomes(START, 4)[0].macrostate
             return dataclasses.replace(rollout, macrostates=np.array([right] * depth))  # of the first, not the second
 
-    monkeypatch.setattr(module, "_HOLD", 1)
     game = game_of(Imaginer(), execution="kinematic")
     frame, _ = game.reset(options={"macrostate": START})
     blank = game.render()[:, -284:]
