@@ -43,7 +43,7 @@ def track(folder: Path, tool: str) -> Path:
 
     Raises:
         UnknownNameError: Another tool.
-        InvalidValueError: No run there has been tested, or it is a bench of regressors.
+        InvalidValueError: No run there has been tested, it is a bench of regressors, or an agent has the tool's name.
         ArtefactError: A table is damaged, or a part of a finished run is missing.
         SetupError: The tool is not installed.
     """
@@ -57,6 +57,8 @@ def track(folder: Path, tool: str) -> Path:
         raise InvalidValueError(f"No run in {folder} has been tested yet; give the folder of a bench.")
     tables = {path.parent: _rows(path) for path in runs}
     out = folder / tool
+    if any(out.glob("seed_*/config.json")):
+        raise InvalidValueError(f"{out} holds the runs of an agent of this name; give another tool to --track.")
     shutil.rmtree(out, ignore_errors=True)
     for run, rows in tables.items():
         writer = make_writer(make_folder(out), run.relative_to(folder))

@@ -102,7 +102,7 @@ def collect(
         watch = _watching(env, motion_hz, motion)
         for index in tqdm(range(episodes), desc=f"{spec.id} {policy.name}", unit="episode", disable=None):
             options = None
-            if policy.name == "uniform":
+            if policy.facts.get("played") == POLICIES["uniform"]:  # an agent may have that name, too
                 options = {"macrostate": open_states[int(starts.integers(len(open_states)))]}
             parts.append(_episode(env, policy.players[index % len(policy.players)], seeds[index], options, watch))
     played = joined(parts)

@@ -161,6 +161,13 @@ def test_what_cannot_be_is_one_clear_error(tmp_path, bench):
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 2 and "pip install 'imagine-bench[tracking]'" in done.stderr
     assert earlier.exists(), "what no tool can write anew stays"
+    config = bench / "tensorboard/seed_0/config.json"
+    config.parent.mkdir()
+    config.touch()
+    with pytest.raises(InvalidValueError, match="tensorboard holds the runs of an agent of this name"):
+        track(bench, "tensorboard")
+    assert config.exists()
+    config.unlink()
     with pytest.raises(UnknownNameError, match="Known: tensorboard, wandb"):
         track(bench, "mlflow")
     with pytest.raises(InvalidValueError, match="has been tested yet"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
@@ -152,3 +153,11 @@ def test_standard_sets_are_of_three_strengths_and_are_kept(tmp_path: Path, monke
     assert cards[1]["played"] == "greedy after 3 episodes of seed 1000" and cards[2]["successes"] == 4
     monkeypatch.setattr(standard_data, "collect", None)
     assert list(standard_data.standard_sets(tmp_path, "npz", 4)) == folders
+
+
+def test_an_agent_called_as_a_policy_plays_whole_episodes() -> None:
+    """Only the policy ``uniform`` begins anywhere and ends after one macro-action."""
+    theirs = replace(policy_of("oracle", TASK, 0), name="uniform")
+    episodes, _, card = collect(TASK, theirs, episodes=4, seed=754, execution="kinematic", appearance="clean")
+    assert card["policy"] == "uniform" and card["successes"] == 4
+    assert episodes.terminated[np.cumsum(episodes.lengths) - 1].all()
