@@ -144,6 +144,22 @@ def test_noise_is_taken_away_and_new_things_are_not() -> None:
     assert (clean[:, 42:50, 4:12].mean(axis=(1, 2)) > 200).all(), "no frame showed this before, and it stays"
 
 
+@pytest.mark.parametrize("brightness", [0.5, 0.7, 1.0, 1.3])
+def test_noise_is_taken_away_in_dark_and_in_bright_frames(brightness: float) -> None:
+    """Dividing a frame by its light changes its noise by as much; a new thing stays where that is less."""
+    rng = np.random.default_rng(5)
+    _, frames = drawn(5)
+    standard = standard_of(noisy(shadowed(frames, rng), rng))
+    assert corrections(standard) == {"light", "noise"}
+    strange = frames[:5].copy()
+    strange[:, 40:52, 2:14] = 190
+    clean = standard.of(noisy(brightness * strange, rng))
+    background = np.s_[:, 31:39, 16:60]
+    assert (clean - strange)[background].std() < 0.35 * 20.0 / brightness
+    if brightness >= 1.0:
+        assert clean[:, 43:49, 5:11].mean() > 110 + 30, "the background is 110"
+
+
 def test_most_hidden_pixels_are_no_numbers_and_few_others() -> None:
     rng = np.random.default_rng(4)
     _, frames = drawn(4)
