@@ -7,7 +7,7 @@ import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsFloat
 
 import numpy as np
 import pytest
@@ -19,6 +19,7 @@ from small_runs import Inline, small, written
 
 from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, SetupError, UnknownNameError
+from imagine_bench.interfaces.environments import Wrapper
 from imagine_bench.judge.verify import Replays, has_own_failures, verdicts
 from imagine_bench.protocols.control import protocol
 from imagine_bench.report import bench_page
@@ -236,6 +237,41 @@ def test_what_a_protocol_says_follows_from_its_runs(
 ) -> None:
     folder = rewrite_protocol(forged(pair, tmp_path, lambda folder: None), **claim)
     assert complaint in " ".join(each.complaint for each in verify(folder))
+
+
+class Lasting(Wrapper):
+    """Each macro-action takes so long, as in contact physics."""
+
+    each_s = 0.0
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        frame, reward, terminated, truncated, info = self.env.step(action)
+        return frame, reward, terminated, truncated, {**info, "sim_time_s": self.each_s}
+
+
+@pytest.mark.parametrize("group", ["training", "rows/0/kept"])
+def test_simulated_times_may_differ_by_a_share(pair: Path, tmp_path: Path, group: str) -> None:
+    """By that by which kinds of CPU differ, 5 %, however long episodes are; what takes no time takes none."""
+    folder = forged(pair, tmp_path, lambda folder: None)
+    shutil.rmtree(folder / "table" / "seed_0")
+    run = OpenRun.read(folder / "table" / "seed_1")
+    times = [name for name in run.arrays if name.endswith("/sim_times_s")]
+    with environments(small(), observation="state") as envs:
+        lasting = [Lasting(env) for env in envs]
+        for each_s, factor, more_s, holds in (
+            *((each_s, factor, 0.0, True) for each_s in (0.01, 30.0) for factor in (0.96, 1.0, 1.04)),
+            *((each_s, factor, 0.0, False) for each_s in (0.01, 30.0) for factor in (0.9, 1.06)),
+            (0.0, 1.0, 0.04, False),
+        ):
+            for name in times:
+                run.arrays[name] = each_s * run.arrays[name.replace("sim_times_s", "lengths")]
+            run.arrays[f"{group}/sim_times_s"][-1] *= factor
+            run.arrays[f"{group}/sim_times_s"][-1] += more_s
+            run.write()
+            for env in lasting:
+                env.each_s = each_s
+            _, found, *_ = verdicts(folder, Replays(*lasting))
+            assert ("simulated time" in found.complaint) != holds and bool(found.complaint) != holds, (each_s, factor)
 
 
 def test_failures_are_a_seeds_own_unless_chance_decides() -> None:
