@@ -76,11 +76,14 @@ class Told:
         return (Failure(job=jobs[1], reason="it broke"),)
 
 
-def tracked(folder, tool, look=lambda job, episode: None):
-    protocol = small(seeds=(0, 1))
+def jobs_of(folder, seeds=(0, 1)):
+    protocol = small(seeds=seeds)
     specs = [RunSpec(protocol=protocol, agent="table", seed=seed) for seed in protocol.seeds]
-    jobs = [Job(spec=spec, folder=folder / f"bench/table/seed_{spec.seed}") for spec in specs]
-    return Tracked(Told(look), tool, "arrow_puzzle").launch(jobs, lambda progress: None)
+    return [Job(spec=spec, folder=folder / f"bench/table/seed_{spec.seed}") for spec in specs]
+
+
+def tracked(folder, tool, look=lambda job, episode: None):
+    return Tracked(Told(look), tool, "arrow_puzzle").launch(jobs_of(folder), lambda progress: None)
 
 
 def test_tensorboard_sees_training_and_tests_while_the_runs_go_on(tmp_path):
@@ -103,6 +106,20 @@ def test_the_command_for_runs_of_merged_benches_names_each_bench(tmp_path, capsy
     said = capsys.readouterr().out
     assert all(f"'imagine-bench report {tmp_path / bench} --track tensorboard'" in said for bench in ("one", "two"))
     assert "Note: 3 of 3 runs" in said and "merged" not in said
+
+
+def test_runs_of_every_stage_are_tracked_and_no_others(tmp_path, capsys):
+    """A bench until its question is decided launches its runs in stages; one of seed 4 was finished before."""
+    tracked = Tracked(Told(lambda job, episode: None), "tensorboard", "arrow_puzzle")
+    for stage in ((0, 1), (2, 3)):
+        tracked.launch(jobs_of(tmp_path, stage), lambda progress: None)
+    runs = [SimpleNamespace(folder=tmp_path / f"bench/table/seed_{seed}") for seed in range(5)]
+    tracked.note(SimpleNamespace(runs=runs[:4]))
+    assert capsys.readouterr().out == ""
+    tracked.note(SimpleNamespace(runs=runs))
+    assert "Note: 1 of 5 runs were finished before" in capsys.readouterr().out
+    for seed in range(4):
+        assert scalars(tmp_path / f"bench/tensorboard/table/seed_{seed}")["training/recent_success"]
 
 
 def test_a_tool_that_fails_costs_no_run(tmp_path, capsys):

@@ -89,6 +89,33 @@ def test_both_cameras_film_the_motion():
     env.close()
 
 
+READINGS = {
+    "motion": lambda scene: scene.motion(),
+    "arm motion": lambda scene: scene.arm_motion(),
+    "agent's film": lambda scene: scene.agent_film(),
+    "film for people": lambda scene: scene.film(80, 60),
+    "a replay that is left": lambda scene: next(scene.replay()),
+}
+
+
+def test_a_reading_of_the_motion_changes_no_later_image():
+    """Nor the scene: neither for the agent nor for people, whether these are drawn quickly or not."""
+    env = make(motion_hz=5)
+    env.reset(seed=1)
+    env.step(0)
+    scene = env.unwrapped
+    for quickly in (False, True):
+        scene.draws_quickly = quickly
+        before = scene.human_view(80, 60), scene.agent_view(), scene.world.physics()
+        for name, read in READINGS.items():
+            read(scene)
+            after = scene.human_view(80, 60), scene.agent_view(), scene.world.physics()
+            for then, now in zip(before, after, strict=True):
+                np.testing.assert_array_equal(now, then, err_msg=name)
+            assert scene.draws_quickly == quickly, name
+    env.close()
+
+
 def test_a_standing_scene_is_one_sample_at_rest():
     for options in ({"execution": "kinematic", "motion_hz": 100}, {}):
         env = make(**options)
