@@ -5,9 +5,11 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import re
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,6 +23,7 @@ from imagine_bench.interfaces.model import LearnedGraph, require_graph
 from imagine_bench.judge.predictions import transition_table
 from imagine_bench.judge.questions import about_whole_world
 from imagine_bench.judge.worlds.families import (
+    STREAM,
     YES,
     ChangedRule,
     FactorsChanged,
@@ -35,6 +38,7 @@ from imagine_bench.judge.worlds.graph import edges_of_rules, hamming_distance
 from imagine_bench.judge.worlds.making import LOOK, QUERIES, WorldQuestions, world_questions
 from imagine_bench.judge.worlds.scores import GRAPH, MARGIN, graph_scores, scores_right, world_scores
 from imagine_bench.judge.worlds.tables import Transitions, TransitionTable, likelihood
+from imagine_bench.judge.worlds.words import NO, Named, Words
 from imagine_bench.rules import Dynamics, Rules, states_of_play
 
 SLIPS = "arrows:cubes=2,slip=0.2"
@@ -156,6 +160,71 @@ def test_every_family_is_answered_as_by_brute_force(task: str) -> None:
                 seen.add(family.name)
                 np.testing.assert_allclose(answers[row], expected / expected.sum(), atol=1e-12, err_msg=family.name)
     assert len(seen) == 8
+
+
+class Reader:
+    """A person who knows the rules, and of a question only its words and images."""
+
+    def __init__(self, named: Named) -> None:
+        self.named = named
+
+    def quoted(self, words: Words) -> list[int]:
+        """The macro-actions that the text names, in its order."""
+        return [self.named.actions.index(name) for name in re.findall("“(.*?)”", words.text)]
+
+    def rows(self, states: Sequence[State]) -> Ints:
+        return np.array([self.named.states.index(state) for state in states])
+
+    def understand(self, family: str, words: Words, other: Words) -> SimpleNamespace:
+        """The question as a family of one; ``other`` is of the second member of a pair."""
+        answers = list(words.answers)
+        shown = [(title, state) for title, state in words.images if state is not None]
+        rows = self.rows([state for _, state in shown])
+        options = self.rows(words.answer_images)
+        if set(answers) == {"yes", "no"}:
+            options = np.array([YES if answer == "yes" else NO for answer in answers])
+        elif family == "which of two worlds":
+            options = np.array([NO if answer == "the usual world" else YES for answer in answers])
+        elif answers:
+            options = np.array([STREAM if answer == "never" else int(answer) for answer in answers])
+        found = SimpleNamespace(options=options[None], starts=rows[:1], goals=rows[1:])
+        actions = self.quoted(words)
+        if family == "masked frame":
+            assert [title for title, _ in words.images][1:] == [
+                f"{n}. {self.named.actions[action]}" for n, action in enumerate(actions, 1)
+            ]
+            first = SimpleNamespace(states=rows[:1], actions=actions[:1])
+            return SimpleNamespace(**vars(found), first=first, actions=actions[1:], reached=rows[1:])
+        if family == "reachability":
+            return SimpleNamespace(**vars(found), within=[int(*re.findall("within ([0-9]+)", words.text))])
+        if len(rows) == 2 * STREAM:
+            taken = [self.named.actions.index(title.removeprefix("after: ")) for title, _ in shown[1::2]]
+            steps = SimpleNamespace(states=rows[None, ::2], actions=np.array([taken]), reached=rows[None, 1::2])
+            return SimpleNamespace(**vars(found), shown=steps, pair=actions)
+        if family == "single-cause pairs":
+            found.options = np.stack([options, self.rows(other.answer_images)])[None]
+            rows = np.append(rows, self.rows([state for _, state in other.images if state is not None]))
+        if len(actions) == 1:
+            pair = SimpleNamespace(states=rows[None], actions=np.array([actions + self.quoted(other)]))
+            factors = [self.named.factors.index(name) for name in re.findall("does the (.*) differ", words.text)]
+            pairs = SimpleNamespace(shown=pair)
+            return SimpleNamespace(**vars(found), shown=pair, pairs=pairs, rows=[0], factors=factors)
+        return found
+
+
+@TASKS
+def test_the_words_of_a_question_ask_for_the_answer_that_is_scored(task: str) -> None:
+    by_hand = ByHand(task)
+    reader = Reader(by_hand.asked.named)
+    for family in by_hand.asked.families:
+        answers = family.answer(by_hand.asked.truth)
+        count: Callable[..., list[float]] = getattr(by_hand, family.name.replace(" ", "_").replace("-", "_"))
+        for row in range(0, len(answers), 8):
+            words = family.words(by_hand.asked.named, row)
+            expected = np.array(count(reader.understand(family.name, words[0], words[-1]), 0))
+            if len(expected):
+                exact = answers[row, 1] if answers.ndim == 3 else answers[row]
+                np.testing.assert_allclose(exact, expected / expected.sum(), atol=1e-12, err_msg=family.name)
 
 
 @pytest.mark.parametrize("task", ["arrow_puzzle", SLIPS, "pick_place", "arrow_puzzle_easy", "arrows:cubes=4"])

@@ -15,6 +15,7 @@ from imagine_bench.tasks.macro_env import MacroEnv
 
 from imagine_bench import registry
 from imagine_bench.interfaces import AgentContext, AgentState
+from imagine_bench.testing.checks import AGENT_CHECKS
 from imagine_bench.testing.contract import Checks, checks, report
 
 
@@ -110,3 +111,83 @@ def test_wrong_agents_are_found(capsys: pytest.CaptureFixture[str]) -> None:
     moody, forgetful, blind = _failed(capsys)
     assert "learned otherwise" in blind
     assert "asked twice with explore=False, it acts otherwise" in moody and "it acts otherwise" in forgetful
+
+
+class _Sound(FakeAgent):
+    """Draws its exploring actions, and counts the transitions that it is shown."""
+
+    def __init__(self, context: AgentContext) -> None:
+        super().__init__()
+        self.shown = np.zeros(1)
+
+    def act(self, observation: Any, *, explore: bool) -> int:
+        return super().act(observation, explore=True) if explore else 0
+
+    def observe(self, transition: Any, *, episode: int) -> None:
+        self.shown += 1.0
+
+    def state(self) -> AgentState:
+        return AgentState(arrays={"shown": self.shown.copy()}, values={"rng": self.rng.bit_generator.state})
+
+    def restore(self, state: AgentState) -> None:
+        self.shown = state.arrays["shown"].copy()
+        self.rng.bit_generator.state = state.values["rng"]
+
+
+class _Wild(_Sound):
+    def act(self, observation: Any, *, explore: bool) -> int:
+        return 6
+
+
+class _Counting(_Sound):
+    def act(self, observation: Any, *, explore: bool) -> int:
+        self.shown += not explore
+        return super().act(observation, explore=explore)
+
+
+class _Wordy(_Sound):
+    def diagnostics(self) -> Any:
+        return {"loss": "small"}
+
+
+class _Sharing(_Sound):
+    def state(self) -> AgentState:
+        return dataclasses.replace(super().state(), arrays={"shown": self.shown})
+
+
+class _Uncertain(_Sound):
+    def restore(self, state: AgentState) -> None:
+        self.shown = state.arrays["shown"].copy()
+
+
+class _Forgets(_Sound):
+    def restore(self, state: AgentState) -> None:
+        self.rng.bit_generator.state = state.values["rng"]
+
+
+def _none(context: AgentContext) -> None:
+    """A factory that forgot to return what it made."""
+
+
+@pytest.mark.usefixtures("own_names")
+@pytest.mark.parametrize(
+    ("made", "complaint"),
+    [
+        (_Sound, None),
+        (_none, "it is made: Agent dqn has no method act"),
+        (_Wild, "greedily without a change: Action 6 does not exist"),
+        (_Counting, "acting with explore=False changes its state"),
+        (_Wordy, "diagnostics: no numbers"),
+        (_Sharing, "later learning alters a state that it gave before"),
+        (_Uncertain, "it goes on to the same bits: it acts otherwise"),
+        (_Forgets, "its later state differs"),
+    ],
+)
+def test_each_clause_of_the_contract_finds_its_fault(
+    made: Any, complaint: str | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make = f"{__name__}:{made.__name__}"
+    registry.AGENTS["dqn"] = dataclasses.replace(registry.AGENTS["dqn"], make=make, needs_encoder=False)
+    own = {what: check for what, check in checks(agent="dqn").items() if what in AGENT_CHECKS}
+    assert bool(report(own)) == (complaint is not None)
+    assert complaint is None or complaint in next(_failed(capsys))
