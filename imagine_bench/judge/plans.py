@@ -65,7 +65,7 @@ class PlanResult:
         if self.refused:
             return f"refused: {self.refused}"
         if self.solved:
-            longer = self.done - (self.shortest or self.done)
+            longer = 0 if self.shortest is None else self.done - self.shortest
             return f"solved, {longer} longer than needed" if longer else "solved"
         if self.compared.real_terminated[-1]:
             return f"failed at macro-action {self.done}"

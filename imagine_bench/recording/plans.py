@@ -76,7 +76,7 @@ def _words(plan: PlanResult, done: int, count: int, names: Sequence[str]) -> str
     if plan.refused:
         lines += ["", f"**Refused:** {plan.refused}."]
     elif done == plan.done:
-        shortest = plan.shortest or "none"
+        shortest = "none" if plan.shortest is None else plan.shortest
         lines += ["", f"**{plan.outcome[0].upper()}{plan.outcome[1:]}.** The shortest possible: {shortest}."]
     else:
         lines += ["", "The arm does this without looking again."]

@@ -194,7 +194,7 @@ def _row(plan: PlanResult) -> dict[str, float | str]:
     return {
         "plan": plan.number,
         "start": " ".join(map(str, plan.start)),
-        "shortest": plan.shortest or "",
+        "shortest": "" if plan.shortest is None else plan.shortest,
         "planned": plan.length,
         "done": plan.done,
         "solved": int(plan.solved),

@@ -197,6 +197,8 @@ def test_the_recording_shows_the_same_plans_and_the_arm_moves(
         ({"uncertainty": 0.9}, 0.3, "is above 0.3"),
         ({"accepts": False}, None, "the agent's filter discards macro-action 1"),
         ({"accepts": False, "uncertainty": 0.9}, 1.0, ""),  # the bound replaces the agent's own filter
+        ({"uncertainty": 0.9}, 0.0, "is above 0"),
+        ({"accepts": False, "uncertainty": 0.0}, 0.0, ""),
     ],
 )
 def test_an_uncertain_plan_is_refused_and_says_so(dreams: dict[str, Any], bound: float | None, words: str) -> None:
@@ -250,10 +252,10 @@ def test_plans_of_other_options_lie_in_other_folders(tmp_path: Path, monkeypatch
     folder = bench(imaginer, {}, root=tmp_path, launcher=Inline()).folder
     recording = mock.Mock()
     monkeypatch.setattr("imagine_bench.recording.plans.record_plans", recording)
-    for count, bound in [(1, None), (1, 0.3), (2, None)]:
+    for count, bound in [(1, None), (1, 0.3), (1, 0.0), (2, None)]:
         how: dict[str, Any] = {"count": count, "execution": "kinematic", "max_epistemic": bound}
         plan_report(folder, root=tmp_path, task=None, encoder=None, recorded=1, **how)
         assert recording.call_args.kwargs == {**how, "count": 1, "path": mock.ANY}
     kept = [json.loads(path.read_text()) for path in folder.glob("imaginer/seed_0/plans/*/summary.json")]
-    assert {(each["attempted"], each["max_epistemic"]) for each in kept} == {(1, None), (1, 0.3), (2, None)}
+    assert {(each["attempted"], each["max_epistemic"]) for each in kept} == {(1, None), (1, 0.3), (1, 0.0), (2, None)}
     assert {(each["appearance"], each["execution"]) for each in kept} == {("mild", "kinematic")}
