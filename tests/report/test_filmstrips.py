@@ -14,7 +14,16 @@ from imagine_bench import registry
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.recording import filmstrips
-from imagine_bench.recording.filmstrips import CELL_PX, LABELS_PX, RIGHT, TITLE_PX, WRONG, changes, sampled_filmstrips
+from imagine_bench.recording.filmstrips import (
+    CELL_PX,
+    LABELS_PX,
+    RIGHT,
+    STEP_PX,
+    TITLE_PX,
+    WRONG,
+    changes,
+    sampled_filmstrips,
+)
 from imagine_bench.report import bench_page
 from imagine_bench.store.results import ComparedRollout, RecordedEpisode
 
@@ -73,6 +82,30 @@ def test_real_frames_are_shown_unaltered_and_upright() -> None:
     strip = filmstrips.filmstrip(compared, tuple("abcdef"))
     shown = strip[TITLE_PX : TITLE_PX + CELL_PX : 2, LABELS_PX : LABELS_PX + CELL_PX : 2]
     np.testing.assert_array_equal(shown, compared.start_frame)
+
+
+@pytest.mark.parametrize("last", [0, 2, 3, 4, 9])
+@pytest.mark.parametrize("carried_out", [5, 4])
+def test_every_macro_action_is_judged_up_to_the_one_that_ends_the_episode(last: int, carried_out: int) -> None:
+    """The third is imagined wrongly. After the end real frames are pale, and nothing is judged that was not done."""
+    compared = compared_rollout(np.random.default_rng(0), cut=None)
+    compared = dataclasses.replace(
+        compared,
+        real_frames=compared.real_frames[:carried_out],
+        real_macrostates=compared.real_macrostates[:carried_out],
+        real_rewards=compared.real_rewards[:carried_out],
+        real_terminated=(np.arange(5) >= last)[:carried_out],
+    )
+    strip = filmstrips.filmstrip(compared, tuple("abcdef"))
+    judged, shown = [], []
+    for index in range(5):
+        left = LABELS_PX + (index + 1) * STEP_PX
+        judged.append(colored(strip[:, left - 8 : left + STEP_PX - 8]))
+        whole = strip[TITLE_PX : TITLE_PX + CELL_PX : 2, left : left + CELL_PX : 2]
+        shown.append(index < carried_out and bool((whole == compared.real_frames[index]).all()))
+    counts = [index <= min(last, carried_out - 1) for index in range(5)]
+    assert shown == counts
+    assert judged == [[counts[index] and index != 2, counts[index] and index == 2] for index in range(5)]
 
 
 def recorded(length: int, success: bool) -> RecordedEpisode:
