@@ -224,6 +224,42 @@ def test_a_detour_is_solved_but_not_optimal() -> None:
     assert plan.outcome == "solved, 2 longer than needed"
 
 
+class Cautious(RulesImaginer):
+    """Plans three macro-actions that end nothing, from the true start."""
+
+    env: Any = None
+
+    def imagine(
+        self, frame: Frame, *, actions: NDArray[np.int64] | None, depth: int, rng: np.random.Generator
+    ) -> ImaginedRollout:
+        world, rules = self.env.unwrapped.world, registry.task("arrows:cubes=2").rules
+        state, chosen = world.read().macrostate, list[int]()
+        for _ in range(3):
+            outcomes = [rules.outcomes(state, action)[0] for action in range(4)]
+            chosen.append(next(action for action, outcome in enumerate(outcomes) if not outcome.terminated))
+            state = outcomes[chosen[-1]].macrostate
+        rollout = super().imagine(frame, actions=np.array(chosen), depth=3, rng=rng)
+        return dataclasses.replace(rollout, accepted=np.ones(3, dtype=bool))
+
+
+@pytest.mark.parametrize(("first", "lag"), [(False, 1), (False, 2), (True, 0), (True, 1)])
+def test_a_plan_is_compared_with_what_its_frames_show(first: bool, lag: int) -> None:
+    """A late frame shows what was, and a hidden gesture is read as one more than the last one."""
+    plain = registry.task("arrows:cubes=2")
+    name = f"{plain.id}{',gesture=first' if first else ''}{f',lag={lag}' if lag else ''}"
+    whose = RunSpec(protocol=protocol(name, "smoke", seeds=(0,)), agent="imagination", seed=0)
+    agent = Cautious(context())
+    plans = Trained(agent=agent, spec=whose, task=registry.task(name), episodes=7, folder=Path("somewhere"))
+    with closing(make_env(plans, "kinematic")) as agent.env:
+        plan = carry_out(agent.env, plans, 0)
+    states = [plan.start]
+    for action in plan.compared.rollout.actions.tolist():
+        states.append(plain.rules.outcomes(states[-1], action)[0].macrostate)
+    hidden = len(plain.macrostate_values[-1])
+    seen = [(*state[:-1], hidden if first and step else state[-1]) for step, state in enumerate(states)]
+    assert list(map(tuple, plan.compared.real_macrostates.tolist())) == [seen[max(0, t - lag)] for t in (1, 2, 3)]
+
+
 def test_all_agents_have_the_same_starts_and_tuning_has_others() -> None:
     starts = [
         [plan.start for plan in carried_out(Dreamer(lambda state: 0, accepts=False), 6, seed)] for seed in (0, 3, 1000)
