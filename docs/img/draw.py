@@ -348,7 +348,7 @@ def why() -> None:
     figure.savefig(HERE / "why.png", dpi=130, facecolor="white")
 
 
-CHALLENGES = ("unseen_goal", "changed_rule", "late_frames")
+CHALLENGES = ("unseen_goal-450", "changed_rule-450", "late_frames-716")
 
 
 def separating() -> None:
@@ -356,14 +356,18 @@ def separating() -> None:
 
     Failed tests stand above the solved ones, by cause, where causes are kept; those of all seeds that have them.
     """
-    folders = [RESULTS / f"separating-{name}" for name in ("world-453", *(f"{name}-450" for name in CHALLENGES))]
+    folders = [RESULTS / f"separating-{name}" for name in ("world-453", *CHALLENGES)]
     also = {
         "separating-world-453": {
             "factored": ["separating-world-710"],
             "factored:given": ["separating-world-given-710"],
             "laws:given": ["separating-world-given-710"],
             "lewm": [f"separating-world-lewm-{seed}" for seed in (453, 454, 455)],
-        }
+        },
+        **{
+            f"separating-{name}-450": {agent: [f"separating-{name}-716"] for agent in ("factored", "laws:given")}
+            for name in ("unseen_goal", "changed_rule")
+        },
     }
     benches = [json.loads((folder / "bench.json").read_text()) for folder in folders]
     widths = [
@@ -371,7 +375,7 @@ def separating() -> None:
         for folder, kept in zip(folders, benches, strict=True)
     ]
     figure, every = plt.subplots(
-        1, len(folders), figsize=(13.6, 3.4), width_ratios=widths, sharey=True, layout="constrained"
+        1, len(folders), figsize=(15.4, 3.6), width_ratios=widths, sharey=True, layout="constrained"
     )
     for axes, folder, kept in zip(every, folders, benches, strict=True):
         protocol = kept["protocol"]
@@ -394,7 +398,7 @@ def separating() -> None:
         axes.axhline(100 * kept["certificate"]["chance_level"], color=figures.INK, linestyle="--", label="chance")
         axes.axhline(100 * kept["certificate"]["optimum"], color=figures.INK, linewidth=0.8, label="optimum")
         lines = [agent.replace("_", "\n").replace(":", ":\n") for agent in agents]
-        axes.set_xticks(range(len(agents)), lines, fontsize=8)
+        axes.set_xticks(range(len(agents)), lines, fontsize=7.5)
         episodes = last + (protocol["after_episodes"] if protocol["after"] else 0)
         name = folder.name.split("-")[1].replace("_", " ").replace("world", "separating")
         axes.set_title(f"{name}: {episodes:,} episodes", fontsize=9.5)
