@@ -270,11 +270,14 @@ def test_compared_rollouts_are_as_late_and_hidden_as_frames(before: int) -> None
         assert compared.real_macrostates[depth].tolist() == [*directions, read]
 
 
-def test_a_recording_shows_what_the_agent_sees_and_says_what_is_true(tmp_path: Path) -> None:
-    """Frames are those of another environment, played the same way, which delivers them two macro-actions late."""
+@pytest.mark.parametrize("observation", ["frame", "state,proprio"])
+def test_a_recording_shows_what_the_agent_sees_and_says_what_is_true(tmp_path: Path, observation: str) -> None:
+    """Frames are those of another environment, played the same way, which delivers them two macro-actions late; of an
+    agent that sees no frames, too.
+    """
     task, options = "arrows:gesture=first,lag=2", {"gesture": "first", "lag": 2, "execution": "kinematic"}
     path = tmp_path / "late.rrd"
-    with closing(gymnasium.make("imagine_bench/Arrows-v0", **options)) as env:
+    with closing(gymnasium.make("imagine_bench/Arrows-v0", observation=observation, **options)) as env:
         record_run(task, FakeAgent(), name="random", env=env, path=path, seed=3, appearance="clean", episodes=1)
     with closing(gymnasium.make("imagine_bench/Arrows-v0", **options)) as env:
         frame, info = env.reset(seed=episodes.episode_seed("recording", 3, 1))
@@ -284,7 +287,9 @@ def test_a_recording_shows_what_the_agent_sees_and_says_what_is_true(tmp_path: P
             frame, _, terminated, truncated, info = env.step(action)
             frames, infos, over = [*frames, frame], [*infos, info], terminated or truncated
     shown = np.array(by_step(path, "/real/frame", "Image:buffer"), np.uint8)
-    np.testing.assert_array_equal(shown.reshape(-1, 64, 64, 3), frames)
+    differ = (shown.reshape(-1, 64, 64, 3) != frames).any(axis=3).mean(axis=(1, 2))
+    most = 0.0 if observation == "frame" else 0.1  # objects stand a little elsewhere; another arrow is 0.14
+    assert (differ <= most).all(), differ
     texts = by_step(path, "/real/text", "TextDocument:text")
     spec = registry.task(task)
     for text, info in zip(texts, infos, strict=True):

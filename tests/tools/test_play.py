@@ -93,6 +93,26 @@ def test_the_model_imagines_from_the_first_frame_by_the_same_keys():
     game.close()
 
 
+def test_a_model_foresees_what_the_next_frame_shows():
+    """Which is a macro-action late, and hides the gesture after the first one: it is read as one more than the last."""
+
+    class Imaginer(FakeImaginer):
+        def imagine(self, frame, *, actions, depth, rng):
+            rollout = super().imagine(frame, actions=actions, depth=depth, rng=rng)
+            late = START if depth == 1 else (*outcomes[0].macrostate[:-1], 3)
+            return dataclasses.replace(rollout, macrostates=np.array([late] * depth))
+
+    task = registry.task("arrows:gesture=first,lag=1")
+    outcomes = task.rules.outcomes(START, 4)
+    env = gymnasium.make(task.env_id, disable_env_checker=True, render_mode="rgb_array", execution="kinematic")
+    game = KeyboardGame(env, task, Imaginer(), 0)
+    game.reset(options={"macrostate": START})
+    for _ in range(2):
+        until_done(game, 4)
+    assert game.summary().endswith("\nThe model foresaw 2 of 2 macrostates.")
+    game.close()
+
+
 @pytest.fixture
 def keyboard(monkeypatch):
     """Keys pressed one after another, each held for three images, then the window is closed."""
