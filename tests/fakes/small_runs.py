@@ -30,6 +30,11 @@ from imagine_bench.store.run_folder import load_newest
 QUICK: dict[str, Any] = {"execution": "kinematic", "open_loop_starts": 0, "recorded_episodes": 0}
 
 
+def of_before_digests() -> Protocol:
+    """The protocol of :func:`small` as benches of abcb05c have it: without digests of packages."""
+    return dataclasses.replace(small(), code=())
+
+
 def small(task: str = "arrow_puzzle", **changes: Any) -> Protocol:
     few = {"agents": ("table",), "seeds": (0,), "budgets": (4, 9), "evaluation_episodes": 5, **QUICK}
     return protocol(task, "smoke", **{**few, **changes})
@@ -46,7 +51,11 @@ class KilledError(Exception):
 
 
 def do(folder: Path, agent: str = "table", seed: int = 0, every_s: float = 20.0, **changes: Any) -> RunResult:
-    spec = RunSpec(protocol=small(**changes), agent=agent, seed=seed, checkpoint_every_s=every_s)
+    return do_by(small(**changes), folder, agent=agent, seed=seed, every_s=every_s)
+
+
+def do_by(protocol: Protocol, folder: Path, agent: str = "table", seed: int = 0, every_s: float = 20.0) -> RunResult:
+    spec = RunSpec(protocol=protocol, agent=agent, seed=seed, checkpoint_every_s=every_s)
     return run_observed(spec, folder, lambda progress: None)
 
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
-from small_runs import Inline, do, same_but_for_time, small
+from small_runs import Inline, do_by, of_before_digests, same_but_for_time, small
 
 from imagine_bench.adapters.tracking import track
 from imagine_bench.errors import ArtefactError, SetupError
@@ -20,7 +21,7 @@ from imagine_bench.store.loading import load_so_far as load_so_far_of_bench
 from imagine_bench.store.run_folder import load_run, load_so_far, mark_done, recording_path
 
 WHOLE = Path(__file__).parent / "of_abcb05c/whole"
-"""A finished bench of :func:`small`."""
+"""A finished bench of :func:`small`, of before packages had digests."""
 
 
 def unfinished(folder: Path) -> Path:
@@ -78,7 +79,7 @@ def test_what_killed_writers_left_is_swept(tmp_path: Path) -> None:
     litter = [tmp_path / ".metrics.csv.999.partial", checkpoint.parent / ".partial_checkpoint_000009_episode_1"]
     litter[0].write_text("half")
     litter[1].mkdir()
-    do(tmp_path)
+    do_by(of_before_digests(), tmp_path)
     assert not any(path.exists() for path in litter)
 
 
@@ -142,7 +143,7 @@ def test_changed_facts_are_refused(tmp_path: Path, name: str, values: dict[str, 
     path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
     for read, where in (
         (load_so_far_of_bench, folder),
-        *(((load_so_far, run), (do, run)) if run in path.parents else ()),
+        *(((load_so_far, run), (partial(do_by, of_before_digests()), run)) if run in path.parents else ()),
     ):
         with pytest.raises(ArtefactError, match=rf"{name} is damaged"):
             read(where)

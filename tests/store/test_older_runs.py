@@ -9,7 +9,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-from small_runs import Inline, final_arrays, same_but_for_time, small
+from small_runs import Inline, final_arrays, of_before_digests, same_but_for_time, small
 
 from imagine_bench.running.bench import bench, load_bench, read_protocol
 from imagine_bench.store.bench_folder import bench_folder
@@ -21,7 +21,7 @@ OLDER = Path(__file__).parent / "of_abcb05c"
 
 def test_a_killed_bench_is_read_and_ends_in_the_bits_of_a_whole_one(tmp_path: Path) -> None:
     protocol = read_protocol(OLDER / "whole")
-    assert protocol == small() and protocol.hash == "c12d19f8f687"
+    assert protocol == of_before_digests() and protocol.hash == "c12d19f8f687"
     folder = bench_folder(tmp_path, protocol)
     shutil.copytree(OLDER / "killed", folder)
     assert load_so_far(folder).protocol.budgets == (4,)
