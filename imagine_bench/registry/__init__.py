@@ -262,16 +262,21 @@ def spelled(name: str, group: str) -> str:
 
 
 def setting_names(agent: str) -> frozenset[str]:
-    """The dotted names of all settings that an agent has."""
+    """The dotted names of all settings that an agent has. Raises SetupError: its package offers them wrongly."""
     where = agent_entry(agent).settings
-    return load(where).names() if where else frozenset()
+    with guests_faults(f"Agent {agent}, its settings", where):
+        return load(where).names() if where else frozenset()
 
 
 def inert_settings(agent: str) -> frozenset[str]:
-    """The dotted names of an agent's settings that have no effect on it, as far as it says so."""
+    """The dotted names of an agent's settings that have no effect on it, as far as it says so.
+
+    Raises SetupError: its package offers them wrongly.
+    """
     where = agent_entry(agent).settings
-    inert = getattr(load(where), "inert", None) if where else None
-    return frozenset() if inert is None else inert()
+    with guests_faults(f"Agent {agent}, its settings", where):
+        inert = getattr(load(where), "inert", None) if where else None
+        return frozenset() if inert is None else inert()
 
 
 def own_settings(agent: str, overrides: Mapping[str, Setting]) -> dict[str, Setting]:
