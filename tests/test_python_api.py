@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 from imagine_bench.agents.baselines import RandomAgent
 from kept import RESULTS, table
+from small_runs import TWO_EPISODES
 
 import imagine_bench
 from imagine_bench import api, cli, registry
@@ -35,14 +36,6 @@ from imagine_bench.judge.models import model_entry
 from imagine_bench.registry.by_value import CodeByValue, code_digest
 from imagine_bench.running.trained import learners, load_trained
 
-_FEW: dict[str, Any] = {
-    "preset": "smoke",
-    "seeds": 1,
-    "budgets": [1, 2],
-    "evaluation_episodes": 2,
-    "execution": "kinematic",
-    "launcher": "this_process",
-}
 _LOCK = threading.Lock()
 _TIMES = ("train_cpu_s", "eval_cpu_s")
 _SOURCE = """
@@ -158,7 +151,7 @@ def numbers(results: api.Comparison, table: str = "") -> dict[str, list[Any]]:
 
 @pytest.mark.slow
 def test_a_worker_process_gives_the_bits_of_this_process(tmp_path: Path) -> None:
-    given = {**_FEW, "agents": ["dqn", code()["MyAgent"]], "execution": "physics"}
+    given = {**TWO_EPISODES, "agents": ["dqn", code()["MyAgent"]], "execution": "physics"}
     here, there = (
         imagine_bench.bench("arrow_puzzle", **{**given, "launcher": launcher}, out=tmp_path / launcher)
         for launcher in ("this_process", "local")
@@ -174,7 +167,7 @@ def test_a_worker_process_gives_the_bits_of_this_process(tmp_path: Path) -> None
 @pytest.mark.slow
 @pytest.mark.parametrize("from_stdin", [True, False])
 def test_a_script_needs_no_guard(from_stdin: bool, tmp_path: Path) -> None:
-    call = {**_FEW, "launcher": "local", "workers": 1, "agents": ["MyAgent"]}
+    call = {**TWO_EPISODES, "launcher": "local", "workers": 1, "agents": ["MyAgent"]}
     text = _SOURCE + (
         "import imagine_bench\n"
         "imagine_bench.register_agent('MyAgent', MyAgent)\n"
@@ -189,13 +182,13 @@ def test_a_script_needs_no_guard(from_stdin: bool, tmp_path: Path) -> None:
 @pytest.fixture
 def results(tmp_path: Path) -> api.Comparison:
     """A small bench of a class."""
-    return imagine_bench.bench("arrow_puzzle", agents=["random", Shifting], out=tmp_path, **_FEW)
+    return imagine_bench.bench("arrow_puzzle", agents=["random", Shifting], out=tmp_path, **TWO_EPISODES)
 
 
 def test_a_changed_class_resumes_no_run(results: api.Comparison, capsys: pytest.CaptureFixture[str]) -> None:
     run = results.folder / "Shifting/seed_0"
     content = {path: path.read_bytes() for path in results.folder.rglob("*") if path.is_file()}
-    again = {**_FEW, "agents": ["random", Shifting], "out": results.folder.parents[1]}
+    again = {**TWO_EPISODES, "agents": ["random", Shifting], "out": results.folder.parents[1]}
     assert imagine_bench.bench("arrow_puzzle", **again, track="tensorboard").folder == results.folder
     said = capsys.readouterr().out
     assert "All runs lie in" in said and "Note: 2 of 2 runs were finished before and are not tracked" in said
@@ -329,7 +322,7 @@ def test_an_interrupted_call_says_that_it_goes_on(tmp_path: Path) -> None:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt, match="the same call goes on from the last checkpoints"):
-        imagine_bench.bench("arrow_puzzle", agents=[Stopped], out=tmp_path, **_FEW)
+        imagine_bench.bench("arrow_puzzle", agents=[Stopped], out=tmp_path, **TWO_EPISODES)
 
 
 def test_a_class_without_a_method_is_named_before_anything_is_played(tmp_path: Path) -> None:
@@ -345,7 +338,7 @@ def test_a_class_without_a_method_is_named_before_anything_is_played(tmp_path: P
 
     sentence = "Half has no method diagnostics and no restore; an agent has act, observe, diagnostics, state, restore."
     with pytest.raises(ImagineBenchError, match=sentence):
-        imagine_bench.bench("arrow_puzzle", agents=[Half], out=tmp_path, **_FEW)
+        imagine_bench.bench("arrow_puzzle", agents=[Half], out=tmp_path, **TWO_EPISODES)
 
 
 @pytest.mark.parametrize(
@@ -372,4 +365,4 @@ def test_any_single_integer_is_an_action_and_nothing_else_is(
 
     fails = pytest.raises(RunFailedError, match=said) if said else contextlib.nullcontext()
     with fails:
-        imagine_bench.bench("arrow_puzzle", agents=[Odd], out=tmp_path, **_FEW)
+        imagine_bench.bench("arrow_puzzle", agents=[Odd], out=tmp_path, **TWO_EPISODES)

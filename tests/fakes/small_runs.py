@@ -28,6 +28,15 @@ from imagine_bench.store.results import BenchResult, RunResult
 from imagine_bench.store.run_folder import load_newest
 
 QUICK: dict[str, Any] = {"execution": "kinematic", "open_loop_starts": 0, "recorded_episodes": 0}
+TWO_EPISODES: dict[str, Any] = {
+    "preset": "smoke",
+    "seeds": 1,
+    "budgets": [1, 2],
+    "evaluation_episodes": 2,
+    "execution": "kinematic",
+    "launcher": "this_process",
+}
+"""Arguments of a bench by :func:`imagine_bench.bench` with two training episodes, in this process."""
 
 
 def of_before_digests() -> Protocol:

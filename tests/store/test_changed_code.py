@@ -6,11 +6,10 @@ import dataclasses
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import pytest
 from guest_packages import Guests
-from small_runs import Inline
+from small_runs import TWO_EPISODES, Inline
 
 import imagine_bench
 from imagine_bench import api, registry
@@ -27,14 +26,6 @@ from imagine_bench.store.bench_folder import read_control
 from imagine_bench.sweep.grid import Study, Variant
 from imagine_bench.sweep.run import run_study
 
-_OPTIONS: dict[str, Any] = {
-    "preset": "smoke",
-    "seeds": 1,
-    "budgets": [1, 2],
-    "evaluation_episodes": 2,
-    "execution": "kinematic",
-    "launcher": "this_process",
-}
 _COMMENT = "\n# another version\n"
 _DONE = "All runs lie in"
 _CHANGED = "the code of an agent or of the task was changed since"
@@ -55,7 +46,9 @@ def module(guests: Guests) -> Path:
 @pytest.fixture
 def bench(tmp_path: Path) -> Bench:
     """Runs a small bench of that agent, always by the same call."""
-    return lambda: imagine_bench.bench("arrow_puzzle", agents=["random", "theirs"], out=tmp_path / "runs", **_OPTIONS)
+    return lambda: imagine_bench.bench(
+        "arrow_puzzle", agents=["random", "theirs"], out=tmp_path / "runs", **TWO_EPISODES
+    )
 
 
 def files(folder: Path) -> dict[Path, bytes]:
@@ -102,16 +95,16 @@ def test_a_class_of_an_installed_package_has_the_digest_of_that_package(
     module = guests.new("agent", "theirs") / "src/theirs.py"
     agent = import_module("theirs").Theirs
     of = CodeByValue.of
-    run = imagine_bench.bench("arrow_puzzle", agents=[agent], out=tmp_path, **_OPTIONS).folder / "Theirs/seed_0"
+    run = imagine_bench.bench("arrow_puzzle", agents=[agent], out=tmp_path, **TWO_EPISODES).folder / "Theirs/seed_0"
     assert load_trained(run).episodes == 2
     with monkeypatch.context() as earlier:
         earlier.setattr(CodeByValue, "of", classmethod(lambda cls, made: dataclasses.replace(of(made), module="")))
-        before = imagine_bench.bench("arrow_puzzle", agents=[agent], out=tmp_path / "before", **_OPTIONS).folder
-    again = imagine_bench.bench("arrow_puzzle", agents=[agent], out=tmp_path / "before", **_OPTIONS).folder
+        before = imagine_bench.bench("arrow_puzzle", agents=[agent], out=tmp_path / "before", **TWO_EPISODES).folder
+    again = imagine_bench.bench("arrow_puzzle", agents=[agent], out=tmp_path / "before", **TWO_EPISODES).folder
     assert again == before, "a bench of before classes had the digests of packages"
     assert load_trained(before / "Theirs/seed_0").episodes == 2
     edit(module)
-    other = imagine_bench.bench("arrow_puzzle", agents=[agent], out=tmp_path, **_OPTIONS).folder
+    other = imagine_bench.bench("arrow_puzzle", agents=[agent], out=tmp_path, **TWO_EPISODES).folder
     assert other != run.parent.parent
     with pytest.raises(ArtefactError, match="code of agent Theirs is not that of this bench"):
         load_trained(run)
