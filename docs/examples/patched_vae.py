@@ -2,7 +2,8 @@
 
 python patched_vae.py encoders/patched_vae.safetensors --steps 1200
 
-The same command goes on after an interruption. bfloat16 and channels_last make a frame cheaper.
+The same command goes on after an interruption. It computes in float32: with bfloat16 the result depends on the processor.
+On one that has instructions for bfloat16, a classifier read 31 % of new frames after the training, and 69 % with float32.
 """
 
 from __future__ import annotations
@@ -57,13 +58,11 @@ def schedule(step: int, steps: int) -> tuple[int, float]:
 
 
 def loss_of(vae: Vae, images: Tensor, noise: Tensor, beta: float) -> Tensor:
-    """As Vae.elbo, with the networks in bfloat16 and the loss in float32."""
+    """As Vae.elbo, with frames in the memory order that makes them cheap on a CPU."""
     target = vae.target(images).contiguous(memory_format=torch.channels_last)
-    with torch.autocast("cpu", torch.bfloat16):
-        mu, log_variance = vae.posterior(target)
-        mu, log_variance = mu.float(), log_variance.float()
-        generated = vae.generate(mu + (0.5 * log_variance).exp() * noise)
-    return vae.log_loss(generated.float(), target).mean() + beta * vae.information(mu, log_variance)
+    mu, log_variance = vae.posterior(target)
+    generated = vae.generate(mu + (0.5 * log_variance).exp() * noise)
+    return vae.log_loss(generated, target).mean() + beta * vae.information(mu, log_variance)
 
 
 def train(vae: Vae, data: FrameSet, recipe: Recipe, steps: int, generator: torch.Generator, kept: Unfinished) -> float:
