@@ -2,8 +2,8 @@
 
 python patched_vae.py encoders/patched_vae.safetensors --steps 1200
 
-The same command goes on after an interruption. It computes in float32: with bfloat16 the result depends on the processor.
-On one that has instructions for bfloat16, a classifier read 31 % of new frames after the training, and 69 % with float32.
+The same command goes on after an interruption. It computes in float32, since the result in bfloat16 depends on the
+processor: on one that has instructions for bfloat16 a classifier read 31 % of new frames, and 69 % after float32.
 """
 
 from __future__ import annotations
