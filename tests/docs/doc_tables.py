@@ -41,13 +41,33 @@ class Table:
     lines: tuple[str, ...]
     spec: str
 
+    @property
+    def entries(self) -> list[str]:
+        """The arguments of each row, where the comment names them."""
+        parts = self.spec.split("; ")
+        return next((part.removeprefix("rows: ").split("|") for part in parts if part.startswith("rows:")), [])
+
+    @property
+    def rows(self) -> list[list[Any]]:
+        """The cells of each row, as they are."""
+        return [_cells(line) for line in self.lines[2:] if line.startswith("|")]
+
+    def misnamed(self) -> list[str]:
+        """Names of rows that are words of another row's arguments, and not of their own."""
+        words = [{word.partition(":")[0] for word in re.split(r"[,/]", entry)} for entry in self.entries]
+        names = [re.findall(r"`([^`:]+)", row[0]) for row in self.rows]
+        return [
+            name
+            for own, row in zip(words, names, strict=False)
+            for name in row
+            if name not in own and any(name in others for others in words)
+        ]
+
     def expected(self) -> list[str]:
         """The lines as they should be."""
         *before, columns = self.spec.split("; ")
         folders = dict(pair.split("=") for part in before if not part.startswith("rows:") for pair in part.split())
-        named = [part.removeprefix("rows: ").split("|") for part in before if part.startswith("rows:")]
-        entries, specs = (named[0] if named else []), columns.split("|")
-        rows: list[list[Any]] = [_cells(line) for line in self.lines[2:] if line.startswith("|")]
+        entries, specs, rows = self.entries, columns.split("|"), self.rows
         if entries and len(entries) != len(rows):
             raise ValueError(f"{len(entries)} rows are named and {len(rows)} are there: {self.lines[0]}")
         for index, row in enumerate(rows):

@@ -42,6 +42,16 @@ def test_tables_say_what_was_kept(page_with_tables: Path) -> None:
     assert text.count("<!-- table:") == len(list(tables(text))), "a comment stands before no table"
     for table in tables(text):
         assert list(table.lines) == table.expected()
+        assert not table.misnamed()
+
+
+def test_a_row_that_has_the_name_of_another_is_found() -> None:
+    head = "<!-- table: A=some; rows: A/dqn|A/dqn:controller.updates_per_step=2|A/oracle; price(@,env_steps) -->\n"
+    rows = ["| agent | n |", "|---|---|", "| `dqn` | 1 |", "| `dqn`, two updates | 2 |", "| `oracle` | 3 |", ""]
+    (right,) = tables(head + "\n".join(rows))
+    (wrong,) = tables(head + "\n".join([*rows[:3], rows[4], rows[3], ""]))
+    assert not right.misnamed()
+    assert wrong.misnamed() == ["oracle", "dqn"]
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page.name != "thesis.md"], ids=name)
