@@ -1,7 +1,8 @@
 """The meaning of an action of a control period: a hand twist, a hand pose, or joints; and the servos' commands for it.
 
 Commands go on from the commands before, not from where the arm is: the hand does not drift while it is asked for
-nothing. Speeds, joint ranges and the workspace hold for every action; the servos' forces are limited in the model.
+nothing. The joints' speeds and ranges hold for every action, the workspace for hand twists and poses alone; the servos'
+forces are limited in the model.
 """
 
 from __future__ import annotations

@@ -100,10 +100,10 @@ class MotionEnv(SceneEnv):
     Episode End: terminated where the rules say so, or at a fault; truncated after 3 s for each macro-action of the
     task's horizon, or when the simulation blew up, with reward 0 and ``fault_reason``.
 
-    Info: ``macrostate`` (int64, (M,)), ``event`` (whether the macrostate changed in this period), ``macro_action`` (the
-    macro-action that the event amounts to, or -1), ``is_success``, ``success``, ``legal``, ``fault``, ``fault_reason``,
-    ``limited`` (the reason that kept the command from the action, or empty), ``sim_time_s`` (of this period),
-    ``elapsed_s`` (since the start), ``instruction`` (empty unless ``told``).
+    Info: ``macrostate`` (int64, (M,)), ``event`` (whether the macrostate changed in this period, or a fault happened),
+    ``macro_action`` (the macro-action that the event amounts to, or -1), ``is_success``, ``success``, ``legal``,
+    ``fault``, ``fault_reason``, ``limited`` (the reason that kept the command from the action, or empty),
+    ``sim_time_s`` (of this period), ``elapsed_s`` (since the start), ``instruction`` (empty unless ``told``).
 
     Args:
         spec: The task.

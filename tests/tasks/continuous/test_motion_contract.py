@@ -53,3 +53,15 @@ def test_a_command_that_meets_a_limit_is_clipped_and_names_it(
     if limit == "workspace":
         assert limits[0] == ""
         assert env.hand_target_m()[2] == pytest.approx(WORKSPACE_HIGH_M[2], abs=2e-3)
+
+
+@pytest.mark.parametrize("control", ["joint_delta", "joint"])
+def test_joint_commands_are_not_held_in_the_workspace(control: str) -> None:
+    env = make_arrows(control=control, observation="proprio")
+    env.reset(seed=0)
+    for _ in range(20):
+        first = 1.0 if control == "joint_delta" else env.servo_targets()[0] + 0.05
+        joints = np.zeros(7) if control == "joint_delta" else env.servo_targets()[:7]
+        action = np.array([first, *joints[1:], 1.0], dtype=np.float32)
+        assert env.step(action)[-1]["limited"] == ""
+    assert env.hand_target_m()[1] > WORKSPACE_HIGH_M[1]
