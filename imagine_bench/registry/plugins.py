@@ -168,20 +168,32 @@ def is_ours(target: str | CodeByValue) -> bool:
 
 
 def package_code(target: str) -> str:
-    """Twelve hex digits of the Python files of the package, or of the single module, in which a ``"module:attr"`` lies.
+    """Twelve hex digits of the files of the package, or of the single module, in which a ``"module:attr"`` lies.
 
-    All of its files count, since nobody knows which of them decide; none is imported. Empty for code of this suite, all
-    of its guests included, of which benches keep the commit, and for code of a notebook.
+    All of its files count, since nobody knows which of them decide: a world's XML does as code does. Hidden files and
+    bytecode do not. None is imported. Empty for code of this suite, all of its guests included, of which benches keep
+    the commit, and for code of a notebook.
     """
     top = _top(target)
     if top in {"__main__", "imagine_bench", *(guest.module for guest in guests())}:
         return ""
     found = find_spec(top)
     folders = (found.submodule_search_locations or ()) if found else ()
-    files = sorted(file for folder in folders for file in Path(folder).rglob("*.py"))
-    if found and found.has_location and not files:
-        files = [Path(str(found.origin))]
-    return hashlib.sha256(b"".join(map(Path.read_bytes, files))).hexdigest()[:12] if files else ""
+    files = sorted((file.relative_to(folder), file) for folder in map(Path, folders) for file in folder.rglob("*"))
+    kept = [(name, file) for name, file in files if file.is_file() and not _is_passing(name)]
+    code = [file for _, file in kept if file.suffix == ".py"]
+    if found and found.has_location and not code:
+        code = [Path(str(found.origin))]
+    whole = hashlib.sha256(b"".join(map(Path.read_bytes, code)))
+    for name, file in kept:
+        if file.suffix != ".py":
+            whole.update(name.as_posix().encode() + hashlib.sha256(file.read_bytes()).digest())
+    return whole.hexdigest()[:12] if code else ""
+
+
+def _is_passing(name: Path) -> bool:
+    """Whether a file of a package is hidden or bytecode, which comes and goes by itself."""
+    return any(part.startswith(".") or part == "__pycache__" for part in name.parts)
 
 
 def packages_of(targets: Iterable[str]) -> set[str]:

@@ -79,6 +79,25 @@ def test_changed_code_of_a_package_begins_a_new_bench(
     assert {path: path.read_bytes() for path in kept} == {**kept, **files(first / "report")}
 
 
+def test_other_files_of_a_package_count_as_its_code_does(guests: Guests) -> None:
+    package = guests.new("agent", "mine") / "src/mine"
+    module = package.with_suffix(".py")
+    package.mkdir()
+    module.rename(package / "__init__.py")
+    before = registry.package_code("mine:ENTRY")
+    (package / ".cache").write_text("hidden")
+    (package / "__pycache__").mkdir(exist_ok=True)
+    (package / "__pycache__" / "mine.pyc").write_bytes(b"bytecode")
+    assert before and registry.package_code("mine:ENTRY") == before
+    seen = {before}
+    for name, text in (("scene.xml", "<a/>"), ("scene.xml", "<b/>"), ("other.xml", "<b/>")):
+        (package / name).write_text(text)
+        seen.add(registry.package_code("mine:ENTRY"))
+    (package / "scene.xml").unlink()
+    seen.add(registry.package_code("mine:ENTRY"))
+    assert len(seen) == 5
+
+
 def test_an_agent_of_changed_code_is_not_taken_up(module: Path, bench: Bench) -> None:
     run = bench().folder / "theirs/seed_0"
     assert load_trained(run).episodes == 2
