@@ -32,14 +32,18 @@ Runs = dict[int, list[dict[str, str]]]
 Estimator = Callable[..., statistics.Estimate]
 
 
+BOLD = "**"
+ITALIC = "*"  # of a cell that is worse, where bold means better
+
+
 @dataclass(frozen=True)
 class Compared:
-    """A cell that compares two sets of runs: bold where the table's tests, taken together, show a difference."""
+    """A cell that compares two sets of runs: marked where the table's tests, taken together, show a difference."""
 
     text: str
     p: float
     detectable: Callable[..., float]  # of the number of tests
-    bold: bool = True  # false where a difference to that side is no finding
+    mark: str = BOLD
 
 
 def picked(path: str, **wanted: str) -> list[dict[str, str]]:
@@ -103,12 +107,15 @@ def iqm(budget: str, where: str) -> str:
 
 
 def ahead(budget: str, treated: str, base: str) -> str | list[Compared]:
-    """The same; bold where it is ahead of the base. The base itself, and who does not learn, are not tested."""
+    """The same; bold where it is ahead of the base, italic where it is behind.
+
+    The base itself, and who does not learn, are not tested.
+    """
     if treated == base or not registry.agent_entry(treated.rpartition("/")[2]).learns:
         return iqm(budget, treated)
     found = _compared(budget, treated, base, statistics.difference)
     is_ahead = statistics.iqm(scores(budget, treated)) > statistics.iqm(scores(budget, base))
-    return [replace(found, text=iqm(budget, treated), bold=bool(is_ahead))]
+    return [replace(found, text=iqm(budget, treated), mark=BOLD if is_ahead else ITALIC)]
 
 
 def interval(value: float, low: float, high: float) -> str:

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from doc_cells import CELLS, Compared
+from doc_cells import CELLS, ITALIC, Compared
 from kept import ROOT
 
 from imagine_bench import statistics
@@ -77,9 +77,11 @@ class Table:
             values = [_cell(spec.replace("@", key), folders) for spec in specs]
             rows[index] = [row[0], *(old if new is None else new for old, new in zip(row[1:], values, strict=True))]
         tests = [part for row in rows for cell in row if isinstance(cell, list) for part in cell]
-        adjusted = iter(statistics.holm([test.p for test in tests]).tolist())
-        texts = [[_text(cell, adjusted) if isinstance(cell, list) else cell for cell in row] for row in rows]
-        return [*self.lines[:2], *("| " + " | ".join(row) + " |" for row in texts), *_caption(tests)]
+        is_shown = statistics.holm([test.p for test in tests]) < 1.0 - statistics.LEVEL
+        worse = any(test.mark == ITALIC for test, shown in zip(tests, is_shown, strict=True) if shown)
+        each = iter(is_shown)
+        texts = [[_text(cell, each) if isinstance(cell, list) else cell for cell in row] for row in rows]
+        return [*self.lines[:2], *("| " + " | ".join(row) + " |" for row in texts), *_caption(tests, worse=worse)]
 
 
 def tables(text: str) -> Iterator[Table]:
@@ -96,15 +98,11 @@ def unmarked(text: str) -> list[str]:
     return [block.split("\n")[0] for block in plain if re.search(r"\d\.\d|\d ?%", block)]
 
 
-def _text(parts: list[Compared], adjusted: Iterator[float]) -> str:
-    texts = []
-    for part in parts:
-        shown = next(adjusted) < 1.0 - statistics.LEVEL and part.bold
-        texts.append(f"**{part.text}**" if shown else part.text)
-    return "; ".join(texts)
+def _text(parts: list[Compared], is_shown: Iterator[bool]) -> str:
+    return "; ".join(f"{part.mark}{part.text}{part.mark}" if next(is_shown) else part.text for part in parts)
 
 
-def _caption(tests: Sequence[Compared]) -> list[str]:
+def _caption(tests: Sequence[Compared], *, worse: bool) -> list[str]:
     if not tests:
         return []
     tested = [test for test in tests if not np.isnan(test.p)]
@@ -115,7 +113,8 @@ def _caption(tests: Sequence[Compared]) -> list[str]:
     least, most = (f"{size:.1f}" if size < 9.95 else f"{size:.0f}" for size in (min(sizes), max(sizes)))
     could = f"{least} to {most} points (by cell)" if least != most else f"{least} points"
     few = f" In {len(tests) - len(sizes)} cells there are too few seeds for a test." if len(sizes) < len(tests) else ""
-    bold = f"Bold: the difference is shown (p < 0.05, corrected for {len(tested)} tests)."
+    kind = "it is shown to be better. Italics: it is shown to be worse" if worse else "the difference is shown"
+    bold = f"Bold: {kind} (p < 0.05, corrected for {len(tested)} tests)."
     return ["", f"*{bold} A true difference of {could} would be shown with a probability of 80 %.{few}*"]
 
 
