@@ -141,10 +141,7 @@ def certificate_rows(found: Certificate) -> dict[str, str]:
     if found.memoryless is not None and found.memoryless_bound is not None:
         how = "at most, for there are too many beliefs" if found.beliefs is None else f"over {found.beliefs:,} beliefs"
         rows["with memory"] = f"{_percent(found.optimum)}, {how}"
-        proved = found.memoryless_bound - found.memoryless < _PROVED
-        rows["without memory"] = _percent(found.memoryless) + (
-            ", proved" if proved else f" found; only proved to be at most {_percent(found.memoryless_bound)}"
-        )
+        rows["without memory"] = _without_memory(found.memoryless, found.memoryless_bound)
     moves: dict[tuple[str, str], int] = Counter((children, parents) for _, children, parents in found.dynamics)
     rows["factor graph"] = "; ".join(f"{c} from {p} ({n} actions)" for (c, p), n in moves.items())
     rows["reward and end"] = "; ".join(f"{what} by [{scopes}]" for what, scopes in found.outcomes)
@@ -162,6 +159,14 @@ def certificate_rows(found: Certificate) -> dict[str, str]:
             f"learner with ideal codes and this graph knows an optimal policy{part}"
         )
     return rows
+
+
+def _without_memory(value: float, bound: float) -> str:
+    """The best policy without memory, in words; a value of 0 may be of a world in which none was looked for."""
+    if bound - value < _PROVED:
+        return f"{_percent(value)}, proved"
+    found = f"{_percent(value)} found" if value else "none found"
+    return f"{found}; only proved to be at most {_percent(bound)}"
 
 
 def _percent(share: float) -> str:
