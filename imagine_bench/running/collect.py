@@ -199,7 +199,7 @@ def describe(dataset: Dataset) -> str:
         lines |= {
             "task": f"{card['task']}, {card['execution']} execution, appearance {card['appearance']}",
             "policy": f"{card['policy']} ({card['played']}), seed {card['seed']}",
-            "exact": f"chance {card['chance_level']:.1%}, optimum {card['optimum']:.1%}, "
+            "exact": f"chance {card['chance_level']:.1%}; if all is seen, optimum {card['optimum']:.1%} and "
             f"optimal return {card['optimal_return']:.2f}",
             "faults": f"{card['faults']} macro-actions whose physics disagreed with the rules",
             "apart": f"{', '.join(apart)}: never given to a learner",

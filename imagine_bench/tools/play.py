@@ -120,7 +120,7 @@ class KeyboardGame(gymnasium.Wrapper[Frame, Action, Frame, Action]):
         facts = self._task.facts()
         said = solved_words(self.solved, self.episodes)
         foreseen = f"\nThe model foresaw {self.foreseen} of {self.imagined} macrostates." if self.imagined else ""
-        return f"{said}; chance {facts.chance_level:.1%}, optimum {facts.optimum:.1%}.{foreseen}"
+        return f"{said}; chance {facts.chance_level:.1%}, optimum {facts.optimum:.1%} if all is seen.{foreseen}"
 
     def act(self, action: int) -> tuple[_Step, Iterator[Frame]]:
         """Carry out a macro-action: its result, and images of it, each drawn when it is due."""

@@ -137,7 +137,7 @@ def _section(world: str, rows: Sequence[Row]) -> Section:
         cells.append({**dict.fromkeys(cells[0], DASH), "player (claimed)": f"{_PERSON}: {_NOBODY}"})
     facts = registry.task(rows[0].protocol.task).facts()
     words = [
-        f"Chance solves {percent(facts.chance_level)} % of its episodes and an optimal player "
+        f"Chance solves {percent(facts.chance_level)} % of its episodes and an optimal player who sees all "
         f"{percent(facts.optimum)} %. Solved, return and tests follow from the episodes that a number leads to. The "
         "columns that are marked so are claimed."
     ]
