@@ -20,9 +20,16 @@ def scores(folder: str) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+def levels(folder: str) -> list[dict[str, str]]:
+    """The scores of a judgement of levels. Those of ``structured`` are of a second judgement, with today's agent."""
+    again = scores(folder.replace("-judge", "_structured-judge"))
+    newer = {(row["model"], row["transitions"], row["seed"]): row for row in again}
+    return [newer.get((row["model"], row["transitions"], row["seed"]), row) for row in scores(folder)]
+
+
 def ranking() -> None:
     """Each judged fit by its ranking of policies (L5) and by the loss of planning in it (L6)."""
-    rows = [row for row in scores("arrow_puzzle-levels-judge") if row["value_loss"]]
+    rows = [row for row in levels("arrow_puzzle-levels-judge") if row["value_loss"]]
     models = list(dict.fromkeys(row["model"] for row in rows))
     sizes = sorted({int(row["transitions"]) for row in rows})
     plot, axes = plt.subplots(figsize=(8, 4.4), layout="constrained")
@@ -48,7 +55,7 @@ def ranking() -> None:
 
 def evidence() -> None:
     """Total variation of each judged fit, and its exploit with the upper bound, by the size of its data."""
-    rows = [row for row in scores("arrow_puzzle_clockwise-levels-judge") if row["exploit"]]
+    rows = [row for row in levels("arrow_puzzle_clockwise-levels-judge") if row["exploit"]]
     models = list(dict.fromkeys(row["model"] for row in rows))
     sizes = sorted({int(row["transitions"]) for row in rows})
     plot, panels = plt.subplots(1, len(models), figsize=(9, 3.8), sharex=True, sharey=True, layout="constrained")

@@ -27,8 +27,9 @@ _WORDS = (
     "them, or was another macro-action carried out once? Must it change: does a factor of the outcome depend on the "
     "one cause in which two starts differ?",
     "Single-cause pairs: two starts differ in one cause, and the same macro-action follows. A pair counts only if the "
-    "outcome of both members is chosen right. (The best of nine models in What-If World, arXiv 2605.27589, reach 52 %, "
-    "open ones 28 %, and 14 % where the cause is hard to see. That is another test, with other scenes and a rubric.)",
+    "outcome of both members is chosen right. (In What-If World, arXiv 2605.27589, none of nine models is above 52 %, "
+    "open ones are near 28 %, and some causes that are hard to see have 14 %. That is another test, with other scenes "
+    "and a rubric.)",
 )
 Cells = Mapping[str, Sequence[Mapping[str, Any]]]
 """The cells of each model, one for each seed."""
