@@ -7,6 +7,7 @@ import csv
 import dataclasses
 import functools
 import io
+import shutil
 import subprocess
 import sys
 import threading
@@ -35,6 +36,7 @@ from imagine_bench.interfaces import AgentContext
 from imagine_bench.judge.models import model_entry
 from imagine_bench.registry.by_value import CodeByValue, code_digest
 from imagine_bench.running.trained import learners, load_trained
+from imagine_bench.store import encoders
 
 _LOCK = threading.Lock()
 _TIMES = ("train_cpu_s", "eval_cpu_s")
@@ -230,6 +232,17 @@ def test_a_frame_is_the_table_of_the_report(results: api.Comparison, monkeypatch
     monkeypatch.setitem(sys.modules, "pandas", pandas)
     kind, columns = results.frame()
     assert kind == "pandas" and list(columns)[:3] == ["agent", "seed", "episodes"]
+
+
+def test_a_home_folder_is_meant_by_its_sign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where results are written, where they are read, and the file of an encoder."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    folder = imagine_bench.bench("arrow_puzzle", agents=["random"], out="~/runs", **TWO_EPISODES).folder
+    assert folder.is_relative_to(tmp_path / "runs")
+    assert imagine_bench.load(f"~/{folder.relative_to(tmp_path)}").folder == folder
+    shutil.copy(encoders.bundled()["arrow_puzzle-clean"], tmp_path / "mine.safetensors")
+    spec = registry.task("arrow_puzzle")
+    assert encoders.resolve(spec, "clean", "~/mine.safetensors") == (tmp_path / "mine.safetensors").resolve()
 
 
 def test_a_folder_gives_the_same_results_again(results: api.Comparison) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -310,3 +311,19 @@ def test_actions_frames_and_episode_lengths_are_remembered(trained: Trained) -> 
     assert np.abs(np.subtract(*late(resumed))).max() > 1.0, "with one macro-action left, other things are worth doing"
     resumed.reset_for_new_task()
     assert resumed.state().values["longest"] is None, "another task may cut episodes elsewhere"
+
+
+def cut(learner: LearnedPerceptionAgent, steps: int, seed: int) -> None:
+    """Live an episode that is cut off after so many macro-actions, and goes back to its start until then."""
+    (first, *_) = played(learner, np.random.default_rng(seed), explore=True)
+    for step in range(steps):
+        learner.observe(replace(first, terminated=False, truncated=step + 1 == steps), episode=seed)
+
+
+def test_the_longest_episode_that_was_cut_is_the_time_that_there_is() -> None:
+    learner = agent()
+    longest = []
+    for seed, steps in enumerate((3, 5, 2)):
+        cut(learner, steps, seed)
+        longest.append(learner.state().values["longest"])
+    assert longest == [3, 5, 5]
