@@ -91,7 +91,17 @@ def test_a_reused_outcome_has_the_bits_of_a_simulated_one(task):
     env.close()
 
 
-@pytest.mark.parametrize(("task", "options"), [("arrows:slip=0.5", {"slip": 0.5}), ("pick_place", {})])
+@pytest.mark.parametrize(
+    ("task", "options"),
+    [
+        ("arrows:slip=0.5", {"slip": 0.5}),
+        ("arrows:gesture=first", {"gesture": "first"}),
+        ("arrow_puzzle", {"physics": {"plan_error_mm": 2.0}}),
+        ("arrow_puzzle", {"physics": {"plan_error_deg": 2.0}}),
+        ("pick_place", {}),
+    ],
+    ids=["slip", "where it is put down", "error of place", "error of angle", "gesture"],
+)
 def test_chance_decides_where_outcomes_are_reused(task, options):
     """From one state in physics, to the bit, a macro-action leads where the seed says, as without reuse."""
     spec = registry.task(task)
@@ -106,9 +116,24 @@ def test_chance_decides_where_outcomes_are_reused(task, options):
         for seed in range(6):
             env.reset(seed=seed, options={"macrostate": start})
             env.world.set_state(here)
-            found.append(env.step(action)[4]["macrostate"].tolist())
+            found.append((env.step(action)[4]["macrostate"].tolist(), full_state(env).tobytes()))
         env.close()
     assert found[:6] == found[6:] and any(each != found[0] for each in found)
+
+
+def test_an_outcome_is_not_reused_in_other_physics():
+    """Environments of one process with objects of several masses share no outcome."""
+    usual, heavy, alone = (make(execution="physics", physics={"object_mass": mass}) for mass in (1.0, 2.0, 2.0))
+    for env in (usual, heavy):
+        env.reuse_outcomes()
+    found = []
+    for env in (usual, heavy, alone):
+        env.reset(seed=3)
+        found.append((full_state(env), walk(env, (0, 4))))
+        env.close()
+    assert_same(found[1], found[2])
+    assert_same(found[0][0], found[1][0])
+    assert not np.array_equal(found[0][1][0][1], found[1][1][0][1]), "the mass decides"
 
 
 @pytest.mark.parametrize("task", WORLDS)
@@ -170,6 +195,7 @@ def test_a_state_goes_on_to_the_same_bits(task, execution, appearance, world):
     for each in (env, other):
         each.step(3)
         each.set_state(state)
+        assert_same(*(dataclasses.asdict(one) for one in (each.get_state(), state)))
         assert_same(goes_on(each), expected)
     for wrong in (stranger.get_state(), None):
         with pytest.raises(InvalidValueError, match=r"is no state of"):

@@ -21,7 +21,7 @@ from imagine_bench.protocols.control import Protocol
 from imagine_bench.report import summary_table, write_report
 from imagine_bench.running.bench import bench, load_bench
 from imagine_bench.store.loading import cut, load_so_far, merge
-from imagine_bench.store.results import BenchResult
+from imagine_bench.store.results import BenchResult, KeptEpisodes
 
 
 def load_merged(folders: list[Path], root: Path) -> BenchResult:
@@ -228,6 +228,28 @@ def test_a_table_cut_short_leaves_later_imagination_out(tmp_path: Path) -> None:
     assert [row.episodes for row in short.checkpoints] == list(budgets[:-1])
     assert short.imagined == () and short.sampled_rollouts == ()
     assert len(short.training_success) == len(short.training_length) == budgets[-2]
+
+
+def test_a_row_of_the_first_tests_counts_these_alone(tmp_path: Path) -> None:
+    kept = KeptEpisodes(
+        starts=np.arange(16).reshape(4, 4),
+        lengths=np.array([1, 3, 2, 1]),
+        actions=np.array([5, 0, 1, 2, 3, 4, 0]),
+        returns=np.array([50.0, -7.0, 49.0, 50.0]),
+        success=np.array([True, False, True, True]),
+        faults=np.array([0, 2, 0, 1]),
+        fingerprints=np.arange(4),
+        sim_times_s=np.array([2.0, 6.0, 4.0, 2.0]),
+    )
+    totals: dict[str, Any] = {"test_episodes": 4, "successes": 3, "solved": "1011", "faults": 3}
+    means = {"mean_return": 35.5, "mean_length": 1.75}
+    row = dataclasses.replace(bench_result(tmp_path).runs[0].checkpoints[0], kept=kept, **totals, **means)
+    assert row.of_first(4) == row
+    first = row.of_first(2)
+    assert (first.test_episodes, first.successes, first.solved, first.faults) == (2, 1, "10", 2)
+    assert (first.success_rate, first.mean_return, first.mean_length) == (0.5, 21.5, 2.0)
+    assert first.kept is not None and first.kept.actions.tolist() == [5, 0, 1, 2]
+    assert {len(array) for name, array in vars(first.kept).items() if name != "actions"} == {2}
 
 
 def test_an_agent_of_fewer_seeds_is_whole_with_these(tmp_path: Path) -> None:
