@@ -342,6 +342,7 @@ def verify_tests(
     again = EvaluationCounts()
     if kept is None:
         raise ArtefactError("it keeps no test episodes, as no run of before 2026-11-24 does.")
+    _agree(f"{where}: the ", {"number of tests": len(kept.lengths)}, (protocol.evaluation_episodes,))
     for test in range(protocol.evaluation_episodes):
         played, ends = replays.test(episode_seed(purpose, starts, test), kept.actions_of(test))
         require(ends, f"{where}, test {test}: its actions do not end an episode, or go on after its end.")

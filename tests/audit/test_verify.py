@@ -89,6 +89,9 @@ NAMED = {
     "faults": "the number of faults is",
     "fingerprint": "the fingerprint is",
     "training return": "the return is",
+    "last tests dropped": "the number of tests is 8, and the file says",
+    "last budget dropped": "the list of budgets is (4, 9), and the file says (4,)",
+    "last episode dropped": "the number of training episodes is 9, and the file says 8",
 }
 
 

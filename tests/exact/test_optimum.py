@@ -17,11 +17,20 @@ from imagine_bench.interfaces import Outcome
 from imagine_bench.rules import states_of
 from imagine_bench.tools.describe import describe_task
 
+
+class _NowAndThen(Glimpse):
+    """The finger is shown in the frames of steps 0 and 2 alone."""
+
+    def seen(self, macrostate, step):
+        return ((1.0, macrostate if step in (0, 2) else (*macrostate[:-1], -1)),)
+
+
 WORLDS = {
     "seen": (Wheels(n=2, slip=0.2), Glimpse(), 4),
     "first": (Wheels(n=2, goal_change=0.3), Glimpse(finger="first"), 3),
     "half": (Wheels(n=2, slip=0.1), Glimpse(finger=0.5), 2),
-    "lag 2": (Wheels(n=2, slip=0.3), Glimpse(lag=2), 4),
+    "now and then": (Wheels(n=2, goal_change=0.3), _NowAndThen(), 4),
+    "lag 2": (Wheels(n=2, slip=0.3), Glimpse(lag=2), 5),  # four actions are too few to use a frame so late
     "lag 1, half": (Wheels(n=2, goal_change=0.2), Glimpse(finger=0.5, lag=1), 3),
 }
 ALL = pytest.mark.parametrize(("rules", "sight", "horizon"), WORLDS.values(), ids=list(WORLDS))

@@ -115,22 +115,42 @@ def test_no_more_queries_than_allowed_and_no_macrostate(tmp_path: Path) -> None:
 # --- feedback ----------------------------------------------------------------------------------------------------
 
 
-def test_feedback_is_reward_for_optimal_actions(tmp_path: Path) -> None:
-    """By counting plans: an action is optimal where it leads to a goal by as few actions as any."""
-    played = do(tmp_path / "run", feedback=3.0, budgets=(30,)).training
-    (pupil,) = Pupil.made
-    shown = iter(pupil.shown)
-    rules, right = registry.task("arrow_puzzle").rules, []
+def feedback_of(folder: Path, seed: int = 0, **changes: Any) -> list[list[tuple[bool, bool]]]:
+    """Per training episode and macro-action: whether it was optimal, by counting plans, and whether it was praised."""
+    played = do(folder, seed=seed, seeds=(seed,), feedback=3.0, budgets=(30,), **changes).training
+    assert played is not None
+    shown = iter(Pupil.made[-1].shown)
+    rules, found = registry.task("arrow_puzzle").rules, []
     for episode, start in enumerate(played.starts.tolist()):
         state = tuple(start)
+        found.append(list[tuple[bool, bool]]())
         for action in played.actions_of(episode):
             ((outcome,), (number, seen)) = rules.outcomes(state, action), next(shown)
             goes_on = 1 + fewest_actions(rules, outcome.macrostate) if not outcome.terminated else 999
-            right.append((1 if outcome.success else goes_on) == fewest_actions(rules, state))
             assert (number, seen.action, seen.observation.macrostate) == (episode, action, None)
-            assert seen.reward == outcome.reward + (3.0 if right[-1] else -3.0)
+            assert abs(seen.reward - outcome.reward) == 3.0
+            optimal = (1 if outcome.success else goes_on) == fewest_actions(rules, state)
+            found[-1].append((optimal, seen.reward > outcome.reward))
             state = outcome.macrostate
-    assert next(shown, None) is None and 5 < sum(right) < len(right) - 5
+    assert next(shown, None) is None
+    return found
+
+
+def test_feedback_is_reward_for_optimal_actions(tmp_path: Path) -> None:
+    """An action is optimal where it leads to a goal by as few actions as any."""
+    found = [each for episode in feedback_of(tmp_path / "run") for each in episode]
+    assert all(optimal == praised for optimal, praised in found)
+    assert 5 < sum(optimal for optimal, _ in found) < len(found) - 5
+
+
+def test_a_noisy_teacher_errs_elsewhere_in_each_episode_and_run(tmp_path: Path) -> None:
+    """At an error of 0.5 the first macro-actions of 30 episodes are all judged alike with probability 2e-9."""
+    firsts = []
+    for seed in (0, 1):
+        found = feedback_of(tmp_path / str(seed), seed, feedback_error=0.5)
+        firsts.append([optimal != praised for optimal, praised in (episode[0] for episode in found)])
+        assert len(set(firsts[-1])) == 2
+    assert firsts[0] != firsts[1]
 
 
 def test_a_noisy_teacher_errs_as_often_as_said() -> None:

@@ -147,6 +147,39 @@ def in_training(name: str) -> Forge:
     return in_learner(change)
 
 
+def last_tests_dropped(bench: Path, rng: np.random.Generator) -> None:
+    """The tests of a budget behind its last success are dropped, or the last one, with every figure that follows."""
+    run = one_run(bench, rng)
+    row = one_row(run, rng)
+    kept = KeptEpisodes(**run.kept(row))
+    successes = np.flatnonzero(kept.success[:-1])
+    run.set_tests(row, EvaluationCounts.of(kept.first(int(successes[-1]) + 1 if len(successes) else 1)))
+    run.write()
+
+
+def last_training_episode_dropped(run: OpenRun, rng: np.random.Generator) -> None:
+    """The last training episode was never played, nor its macro-actions tried; the steps agree."""
+    del rng
+    prefix = "training/"
+    kept = {name: array for name, array in run.arrays.items() if name.startswith(prefix)}
+    last = len(kept["training/lengths"]) - 1
+    first = KeptEpisodes(**{name.removeprefix(prefix): array for name, array in kept.items()}).first(last)
+    run.arrays |= {name: getattr(first, name.removeprefix(prefix)) for name in kept}
+    for name in ("success", "length", "queries"):
+        run.values[name].pop()
+    run.values["tried"] = {pair: episode for pair, episode in run.values["tried"].items() if episode < last}
+    run.values["env_steps"] = run.rows[-1]["env_steps"] = sum(run.values["length"])
+
+
+def last_budget_dropped(bench: Path, rng: np.random.Generator) -> None:
+    """The tests of the last budget are left out."""
+    run = one_run(bench, rng)
+    last = len(run.rows) - 1
+    run.drop(f"rows/{last}/")
+    del run.rows[last]
+    run.write()
+
+
 def no_digests(bench: Path, rng: np.random.Generator) -> None:
     (one_run(bench, rng).folder / "DONE").write_text(
         json.dumps(sealed({"format": "imagine_bench run 3", "sha256": {}}))
@@ -216,6 +249,7 @@ FORGERIES: dict[str, Forge] = {
     "after the end": surplus(lengthen=True), "budget": metric("episodes"), "successes": metric("successes"),
     "mean return": metric("mean_return"), "mean length": metric("mean_length"), "sum of faults": metric("faults"),
     "table of a run": metric("mean_length", OpenRun.write_table), "no digests": no_digests,
+    "last tests dropped": last_tests_dropped, "last budget dropped": last_budget_dropped,
 }  # fmt: skip
 IN_TRAINING: dict[str, Forge] = {
     "training steps": metric("env_steps"), "training start": in_training("training/starts"),
@@ -226,4 +260,5 @@ IN_TRAINING: dict[str, Forge] = {
     "exchanged lengths": in_learner(exchanged_lengths),
     "nothing": without("training/"), "no simulated time": without("training/sim_times_s"),
     "no simulated time of tests": without("rows/0/kept/sim_times_s"), "tried": in_learner(tried),
+    "last episode dropped": in_learner(last_training_episode_dropped),
 }  # fmt: skip
