@@ -180,19 +180,28 @@ def package_code(target: str) -> str:
     found = find_spec(top)
     folders = (found.submodule_search_locations or ()) if found else ()
     files = sorted((file.relative_to(folder), file) for folder in map(Path, folders) for file in folder.rglob("*"))
-    kept = [(name, file) for name, file in files if file.is_file() and not _is_passing(name)]
+    kept = [(name, file) for name, file in files if file.is_file() and not _is_hidden_or_bytecode(name)]
     code = [file for _, file in kept if file.suffix == ".py"]
     if found and found.has_location and not code:
         code = [Path(str(found.origin))]
     whole = hashlib.sha256(b"".join(map(Path.read_bytes, code)))
     for name, file in kept:
         if file.suffix != ".py":
-            whole.update(name.as_posix().encode() + hashlib.sha256(file.read_bytes()).digest())
+            state = file.stat()
+            whole.update(name.as_posix().encode() + _file_digest(file, state.st_mtime_ns, state.st_size))
     return whole.hexdigest()[:12] if code else ""
 
 
-def _is_passing(name: Path) -> bool:
-    """Whether a file of a package is hidden or bytecode, which comes and goes by itself."""
+@functools.cache
+def _file_digest(file: Path, mtime_ns: int, size: int) -> bytes:
+    """The SHA-256 of a file, computed once while its time and size stay: a package's weights may be large."""
+    del mtime_ns, size
+    with file.open("rb") as content:
+        return hashlib.file_digest(content, "sha256").digest()
+
+
+def _is_hidden_or_bytecode(name: Path) -> bool:
+    """Whether a file of a package comes and goes by itself."""
     return any(part.startswith(".") or part == "__pycache__" for part in name.parts)
 
 
