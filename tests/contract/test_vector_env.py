@@ -157,6 +157,36 @@ def test_each_lane_goes_its_own_pace_and_the_first_comes_first():
     assert not [each.name for each in threading.enumerate() if each.name.startswith("simulation")]
 
 
+def lasting(act, durations_s, action):
+    """A macro-action that takes the next one of some durations."""
+    *step, info = act(action)
+    return (*step, {**info, "sim_time_s": next(durations_s)})
+
+
+def test_a_lane_begins_at_the_end_of_the_last_one_received():
+    """Lanes that are still acting change nothing. Each macro-action takes a duration that is drawn here."""
+    rng, n_lanes = np.random.default_rng(0), 4
+    vector = make(n=n_lanes, **KINEMATIC)
+    vector.reset(seed=0)
+    durations_s = rng.uniform(1.0, 3.0, (n_lanes, 40))
+    for env, each in zip(vector.envs, durations_s, strict=True):
+        env.act = functools.partial(lasting, env.act, iter(each))
+    now_s, due_s, begun = 0.0, {}, [0] * n_lanes
+    for _ in range(40):
+        idle = [lane for lane in range(n_lanes) if lane not in due_s]
+        sent = rng.permutation(idle)[: rng.integers(not due_s, len(idle) + 1)].tolist()
+        for lane in sent:
+            due_s[lane] = now_s + durations_s[lane, begun[lane]]
+            begun[lane] += 1
+        if sent:
+            vector.send(rng.integers(vector.single_action_space.n, size=len(sent)), sent)
+        n = int(rng.integers(1, len(due_s) + 1))
+        first = sorted(due_s, key=due_s.get)[:n]
+        assert vector.recv(n)[-1]["env_id"].tolist() == first
+        now_s = [due_s.pop(lane) for lane in first][-1]
+    vector.close()
+
+
 def blown_up(env, actions):
     """A step in which lane 1 blows up; its reason, which names a file, as whether there is one."""
     env.envs[1].unwrapped.world.data.joint("cube_2_joint").qpos[0] = 1e11

@@ -25,6 +25,25 @@ def test_held_out_pairs_are_never_trained_on_but_their_values_are(first, second,
         assert {pair[i] for pair in tested} <= {pair[i] for pair in trained}
 
 
+class _Jammed(Wheels):
+    """The last wheel never turns: no start whose finger is at it can be solved."""
+
+    def outcomes(self, state, action):
+        if action // 2 == self.n - 1:
+            return (self.judge(state, action, state),)
+        return super().outcomes(state, action)
+
+
+def test_a_split_by_plan_length_leaves_out_unsolvable_starts():
+    """The others need one turn where the pointed wheel is at 1 or 3, and two turns where it is at 2."""
+    rules = _Jammed(forbid=False)
+    split = split_of(rules, "plan_length=1")
+    solvable = {state for state in rules.start_states if state[-1] != rules.n - 1}
+    far = {state for state in solvable if state[state[-1]] == 2}
+    assert set(split.test) == far and set(split.train) == solvable - far
+    assert 0 < len(solvable) < len(rules.start_states)
+
+
 def test_a_split_is_known_by_its_content():
     split = split_of(RULES, "values=3:2")
     assert {state[3] for state in split.test} == {2} and {state[3] for state in split.train} == {0, 1}

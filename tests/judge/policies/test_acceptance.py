@@ -119,6 +119,22 @@ def test_the_guarantee_breaks_where_data_is_rare() -> None:
     assert found["wrong_on_data"] <= ALPHA < min(found["wrong_rare"], found["wrong_worst_policy"])
 
 
+def test_errors_where_the_data_never_was_are_counted() -> None:
+    """No threshold is learned from them, so all are accepted; the rarest quarter of the macrostates is all wrong."""
+    world = world_of(ARROWS)
+    n_states, n_actions = world.truth.reward.shape
+    never = np.zeros(n_states, dtype=bool)
+    never[-math.ceil(n_states / 4) :] = True
+    data = np.repeat(~never[:, None], n_actions, axis=1) / ((~never).sum() * n_actions)
+    wrong = np.repeat(never, n_actions)
+    found = acceptance_scores(world, data, np.zeros(wrong.size), wrong, np.random.default_rng(0))
+    there = occupancies(world, world.policies.tables)[:, never].sum(axis=(1, 2))
+    assert (found["accepts"], found["wrong_on_data"]) == (pytest.approx(1.0), 0.0)
+    assert found["wrong_rare"] == pytest.approx(1.0)
+    assert found["wrong_policies"] == pytest.approx(there.mean())
+    assert found["wrong_worst_policy"] == pytest.approx(there.max()) != pytest.approx(there.mean())
+
+
 def collected(spec: TaskSpec, policy: str) -> dict[tuple[State, int], float]:
     """How often a policy takes each macro-action, up to a factor: every course of its episodes."""
     found = defaultdict[tuple[State, int], float](float)

@@ -17,6 +17,7 @@ from imagine_bench.tasks.continuous.env import MotionEnv
 from imagine_bench.tasks.continuous.expert import Expert
 from imagine_bench.tasks.continuous.referee import FAULT_REWARD
 from imagine_bench.tasks.continuous.segments import least_seconds, measure, move_aside
+from imagine_bench.tasks.continuous.spec import make_pick_place
 from imagine_bench.tasks.motion.orientation import about_vertical
 from imagine_bench.tasks.world import Reading, World
 
@@ -86,6 +87,19 @@ def test_parameters_of_a_world_mean_what_they_mean_of_macro_actions(family: str,
     assert (env.world.observed(after)[-1] == -1) == bool(hidden and not (family == "pick_place" and after[-1] == 4))
     seen = env.step(np.zeros(7, dtype=np.float32))[0]
     assert np.array_equal(seen["state"], first["state"]) == ("lag" in option)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("option", [{}, {"gesture": "first"}, {"gesture": 0.99}, {"lag": 1}], ids=str)
+def test_a_goal_that_is_told_is_in_no_image(family: str, option: dict[str, Any]) -> None:
+    """Whatever the world's frames show. Without words the first frame shows the pointing hand."""
+    (*objects, first), second = STARTS[family], 1
+    for told in (True, False):
+        env = FAMILIES[family](observation="hand,front", size=32, told=told, **option)
+        starts = [{"macrostate": (*objects, gesture)} for gesture in (first, second)]
+        (seen, info), (other, other_info) = (env.reset(seed=0, options=start) for start in starts)
+        assert all(np.array_equal(seen[camera], other[camera]) for camera in seen) == told
+        assert (info["instruction"] != other_info["instruction"]) == told
 
 
 @pytest.mark.parametrize("signs", [(1, 1, 1, 1), (-1, 1, -1, -1)])
@@ -177,6 +191,30 @@ def test_a_grip_that_slips_leaves_the_object_where_it_is(family: str) -> None:
             assert (tuple(info["macrostate"])[:-1], info["fault"]) == (expected[:-1], False)
             slipped.append(slips)
     assert 9 <= len(slipped) <= 25  # 97 % of seven waits for a firm grip
+
+
+@pytest.mark.parametrize(
+    ("physics", "holds"),
+    [({}, True), ({"pad_friction": 0.01}, False), ({"finger_force_n": 0.3}, False), ({"object_mass": 50.0}, False)],
+    ids=str,
+)
+def test_a_grip_is_as_firm_as_its_physics_also_after_a_slip(physics: dict[str, float], *, holds: bool) -> None:
+    """Six tries to lift the ball: each is an event unless this grip slips, or no grip holds."""
+    env = make_pick_place(observation="proprio", physics=physics, slip=0.5)
+    expert = Expert(env)
+    env.reset(seed=0, options={"macrostate": STARTS["pick_place"]})
+    slipped = []
+    events = [0]
+    for _ in range(6):
+        expert.begin(0)
+        slips = False
+        while not expert.is_done:
+            env.step(expert.act())
+            slips |= env.episode.slipping
+        slipped.append(slips)
+        events.append(env.episode.events)
+    assert True in slipped[:-1]
+    assert np.diff(events).tolist() == [int(holds and not slips) for slips in slipped]
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 from imagine_bench.tasks.arrows.rules import MAX_CUBES
 from imagine_bench.tasks.arrows.scene import layout
 from imagine_bench.tasks.motion.arm_model import ArmModel
-from imagine_bench.tasks.motion.ik import ArmIK, Reach, pointing_down
+from imagine_bench.tasks.motion.ik import ANGLE_TOLERANCE_RAD, POSITION_TOLERANCE_M, ArmIK, Reach, pointing_down
 from imagine_bench.tasks.motion.trajectory import (
     EFFORT_SHARE,
     PEAK_ACCELERATION,
@@ -50,6 +50,26 @@ def test_ik_reaches_with_the_tool_straight_down(arm, ik, slot, height_m):
     assert math.atan2(frame[1, 0], frame[0, 0]) == pytest.approx(math.pi / 4, abs=math.radians(0.2))
     assert (arm.model.jnt_range[:, 0] <= solution.qpos_rad).all()
     assert (solution.qpos_rad <= arm.model.jnt_range[:, 1]).all()
+
+
+@pytest.mark.parametrize("lift_m", [0.0, 0.07])
+@pytest.mark.parametrize("off_deg", [(0, 0, 0), (0, 0, -90), (0, 0, 1), (5, 0, 0), (0, -20, 0)], ids=str)
+def test_a_search_from_a_turned_or_tilted_tool_rights_it(arm, ik, off_deg, lift_m):
+    """It starts at its place, or below it; an upright tool only has to be lifted."""
+    yaw_rad, place_m = 0.3, np.array([*SLOTS_XY_M[0], CUBE_Z_M])
+    turned = mink.SO3.from_rpy_radians(*np.radians(off_deg)) @ pointing_down(yaw_rad)
+    ik.frame_task.set_target(mink.SE3.from_rotation_and_translation(turned, place_m))
+    ik.configuration.update(np.array(HOME_QPOS_RAD))
+    for _ in range(40):
+        ik.configuration.integrate_inplace(ik.next_step(), 1.0)
+    start_rad = ik.configuration.q.copy()
+    assert np.linalg.norm(arm.tcp_in_base(start_rad)[0] - place_m) < POSITION_TOLERANCE_M
+    to_m = place_m + np.array([0, 0, lift_m])
+    found_rad = ik.solve(to_m, yaw_rad, start_rad).qpos_rad
+    assert np.linalg.norm(arm.tcp_in_base(found_rad)[0] - to_m) < POSITION_TOLERANCE_M
+    for qpos_rad, wanted in ((start_rad, turned), (found_rad, pointing_down(yaw_rad))):
+        apart = wanted.inverse() @ mink.SO3.from_matrix(arm.tcp_in_base(qpos_rad)[1])
+        assert np.linalg.norm(apart.log()) < ANGLE_TOLERANCE_RAD
 
 
 def test_the_error_of_a_reach_is_the_larger_one_of_its_two_places(arm, ik):
