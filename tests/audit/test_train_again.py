@@ -9,6 +9,7 @@ import json
 import shutil
 from collections.abc import Callable
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,13 @@ import numpy as np
 import pytest
 from forger import forged, share_weights
 from forging import OpenRun, mixed, rewrite_protocol
-from small_runs import Inline, small, written
+from small_runs import QUICK, Inline, small, written
 
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.running.bench import bench
-from imagine_bench.running.retraining import Retraining, Verdict, chance_to_find, drawn
+from imagine_bench.running.control import plan_control
+from imagine_bench.running.retraining import Retraining, Verdict, chance_to_find, drawn, train_again
 from imagine_bench.store.files import read_sealed, sealed
 from imagine_bench.tools.audits import conclusion, verify, what_is_shown
 
@@ -120,6 +122,43 @@ def test_the_chance_to_find_a_forged_run_is_that_of_drawing_one() -> None:
     for n_forged in (1, 2, 3, 4):
         found = np.mean([bool(seeds & {*range(n_forged)}) for seeds in draws])
         assert found == pytest.approx(chance_to_find(5, n_forged, 2), abs=0.05)
+
+
+def test_draws_of_agents_and_of_benches_are_independent() -> None:
+    """So one run of each agent, even of equal seeds, is found as often as by draws that know nothing of each other."""
+    wanted = small(agents=("table", "random", "oracle"), seeds=(0, 1, 2, 3, 4))
+    other = dataclasses.replace(wanted, evaluation_episodes=7)
+    nonces = [str(nonce) for nonce in range(1000)]
+    draws = np.array([[seed for each in (wanted, other) for _, seed in drawn(each, 1, nonce)] for nonce in nonces])
+    assert draws.shape == (1000, 6)
+    for one, two in combinations(draws.T, 2):
+        assert np.mean(one == two) == pytest.approx(1 / 5, abs=0.06)
+    of_bench = draws[:, :3]
+    assert np.mean((of_bench == 0).any(axis=1)) == pytest.approx(1 - (1 - chance_to_find(5, 1, 1)) ** 3, abs=0.06)
+
+
+def test_an_episode_after_a_dataset_is_named_by_its_number_in_training(tmp_path: Path) -> None:
+    """Where it is played again, and where it is trained again on another processor: six of a dataset come before."""
+    few = {"agents": ("table",), "seeds": (0,), "budgets": (9,), "evaluation_episodes": 2, **QUICK}
+    given = written(tmp_path / "set")
+    wanted, paths = plan_control("arrow_puzzle", "smoke", appearance="mild", dataset=given.folder, **few)
+    honest = bench(wanted, paths, root=tmp_path / "honest", launcher=Inline()).folder
+
+    def change(name: str) -> Forge:
+        def forge(folder: Path) -> None:
+            run = OpenRun.read(folder / "table" / "seed_0")
+            second = int(run.arrays["training/lengths"][0]) if name == "actions" else 1
+            run.arrays[f"training/{name}"][second] = (run.arrays[f"training/{name}"][second] + 1) % 6
+            run.write()
+
+        return forge
+
+    for name, word in {"returns": "return", "starts": "start", "fingerprints": "fingerprint"}.items():
+        first, *_ = verify(forged(honest, tmp_path / name, change(name)))
+        assert first.complaint.startswith(f"training episode 7: the {word} is ")
+    elsewhere(folder := forged(honest, tmp_path / "actions", change("actions")))
+    (found,) = train_again(folder, dataclasses.replace(again(), dataset=given.folder))
+    assert found.complaint.startswith("training episode 7 took other macro-actions")
 
 
 def test_what_a_replay_cannot_show_training_again_does(pair: Path, tmp_path: Path) -> None:

@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 from fake_reader import BlindReader
 from imagine_bench.agents.world_models.reader import images_of
+from judged import labelled, shown
 
 from imagine_bench import registry
+from imagine_bench.arrays import Images, Ints
 from imagine_bench.errors import ArtefactError
-from imagine_bench.judge.reading import reader_in
+from imagine_bench.judge.reading import reader_errors, reader_in
 from imagine_bench.store.files import make_folder
 
 
@@ -55,6 +57,31 @@ def test_a_half_written_reader_is_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "reader.safetensors").write_bytes(b"half")
     with pytest.raises(ArtefactError, match=r"reader\.safetensors is not the judge's reader; remove it, and the same"):
         reader_in(registry.task("pick_place"), "clean", tmp_path)
+
+
+class FlawedReader:
+    """Reads the labels of frames. Of every ten images it refuses some, and misreads one coordinate of the next ones."""
+
+    def __init__(self, refused: int, misread: int) -> None:
+        self.spec = labelled("arrow_puzzle")
+        self._refused = refused
+        self._misread = misread
+
+    def read(self, pictures: Images) -> Ints:
+        place = np.arange(len(pictures)) % 10
+        read = np.array([shown(picture, self.spec) for picture in pictures]).clip(min=0)
+        read[(place >= self._refused) & (place < self._refused + self._misread), -1] += 1
+        read[place < self._refused] = -1
+        return read
+
+
+@pytest.mark.parametrize(("refused", "misread"), [(0, 0), (10, 0), (0, 10), (2, 1), (1, 3)])
+def test_a_refused_frame_is_not_counted_as_misread(refused: int, misread: int) -> None:
+    reader = FlawedReader(refused, misread)
+    errors = reader_errors(reader, reader.spec, "clean")
+    assert (errors["refused"], errors["misread"]) == pytest.approx((refused / 10, misread / 10))
+    assert [errors[f"{name}_read"] for name in ("noise", "blends")] == pytest.approx([1 - refused / 10] * 2, abs=0.01)
+    assert [errors[f"{name}_read"] for name in ("black", "gray")] == [float(refused == 0)] * 2
 
 
 @pytest.mark.parametrize("size", [64, 80, 96, 128])

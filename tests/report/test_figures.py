@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
+import io
 from collections.abc import Iterable
 from itertools import combinations
 
 import numpy as np
 import pytest
-from fake_results import WIDE, bench_result
+from fake_results import DEPTH, WIDE, bench_result
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 
@@ -19,7 +21,7 @@ from imagine_bench.recording.filmstrips import DARK, LIGHT
 from imagine_bench.recording.stream import KINDS, SERIES
 from imagine_bench.report import figures
 from imagine_bench.report.bench import success_figure
-from imagine_bench.report.data import ReportData, collect, open_loop_means
+from imagine_bench.report.data import ReportData, collect, open_loop_csv, open_loop_means
 from imagine_bench.report.sections import open_loop_figure
 
 
@@ -44,6 +46,23 @@ def test_the_success_figure_draws_scores_bands_and_the_thesis(data: ReportData) 
     assert any(np.allclose(each, thesis) for each in lines(axes) if len(each) == len(thesis))
     short = bench_result(data.result.folder, protocol=dataclasses.replace(WIDE, budgets=(10, 20)))
     assert success_figure(collect(short)).axes[0].get_xlim()[1] < 25, "far points of the thesis do not stretch it"
+
+
+def test_the_open_loop_figure_draws_the_means_of_the_file_by_depth(data: ReportData) -> None:
+    """The first macro-action that is imagined has depth 1."""
+    loops = open_loop_means(data.result)
+    panels = {axes.get_title(): lines(axes) for axes in open_loop_figure(loops).axes}
+    rows = [row for row in csv.DictReader(io.StringIO(open_loop_csv(data.result))) if row["episodes"] == "6000"]
+    depths = range(1, DEPTH + 1)
+    for title, name, scale in (
+        ("macrostate right (%)", "correct", 100),
+        ("wrong about the end (%)", "termination_error", 100),
+        ("reward error", "reward_mae", 1),
+    ):
+        for agent, drawn in zip(loops, panels[title], strict=True):
+            of = [row for row in rows if row["agent"] == agent]
+            seeds = [[float(row[name]) for row in of if row["depth"] == str(depth)] for depth in depths]
+            assert np.array(drawn) == pytest.approx(np.column_stack([depths, scale * np.mean(seeds, axis=1)])), title
 
 
 def test_an_uncertainty_that_an_agent_does_not_know_is_not_drawn(data: ReportData) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import textwrap
 from pathlib import Path
 
 import numpy as np
 import pytest
 from fake_results import bench_result, compared_rollout
+from PIL import Image
 
 from imagine_bench import registry
 from imagine_bench.interfaces import TaskSpec
@@ -21,10 +23,12 @@ from imagine_bench.recording.filmstrips import (
     STEP_PX,
     TITLE_PX,
     WRONG,
+    Tile,
     changes,
     sampled_filmstrips,
 )
 from imagine_bench.report import bench_page
+from imagine_bench.report.levels import film_image
 from imagine_bench.store.results import ComparedRollout, RecordedEpisode
 
 PICK_PLACE = registry.task("pick_place")
@@ -130,6 +134,31 @@ def test_an_episode_s_strip_shows_every_frame_and_the_end(length: int) -> None:
     assert all(len(cell) == CELL_PX**2 for cell in cells), "each frame once, whole"
     places = [tuple(cell[0]) for cell in cells]
     assert places == sorted(places) and strip.shape[1] < 700, "in order, and it fits a page"
+
+
+def numbered(actions: list[int]) -> list[Tile]:
+    """The words above the images of an episode."""
+    words = [f"{step}. {PICK_PLACE.action_names[action]}" for step, action in enumerate(actions, 1)]
+    return [Tile(None, above) for above in ("start", *words)]
+
+
+def test_the_macro_actions_of_an_episode_are_numbered_from_one() -> None:
+    strip = filmstrips.episode_strip(recorded(3, success=True), PICK_PLACE.action_names)
+    expected = filmstrips.sheet([("", numbered([0, 1, 2]))])
+    top = TITLE_PX - 4  # where the border begins
+    np.testing.assert_array_equal(strip[:top], expected[:top])
+
+
+def test_the_macro_actions_of_an_overrated_policy_are_numbered_from_one() -> None:
+    believed, real = [(0, 0.0, False), (2, 10.0, True)], [(0, 0.0, False), (1, -1.0, False), (3, -1.0, True)]
+    film = {"start": "here", "returns": (10.0, -2.0), "believed": believed, "real": real}
+    frames = {f"film_{name}": np.zeros((4, 64, 64, 3), dtype=np.uint8) for name in ("believed", "real")}
+    frames["film_believed"] = frames["film_believed"][:3]
+    image = film_image("exact", "the model", PICK_PLACE, film, frames)
+    shown = np.asarray(Image.open(io.BytesIO(image.png)).convert("RGB"))
+    for row, course in zip(np.array_split(shown, 2), (believed, real), strict=True):
+        expected = filmstrips.sheet([("", numbered([action for action, *_ in course]))], columns=4)
+        np.testing.assert_array_equal(row[:TITLE_PX], expected[:TITLE_PX])
 
 
 def test_a_report_begins_with_a_solved_and_a_lost_episode(tmp_path: Path) -> None:

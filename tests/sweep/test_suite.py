@@ -21,7 +21,8 @@ from imagine_bench.report.page import texts
 from imagine_bench.report.sweep import levels_csv, scores_csv, suite_page
 from imagine_bench.sweep import grid
 from imagine_bench.sweep.grid import GRIDS, SUITE, Experiment, Level, Suite
-from imagine_bench.sweep.run import plan_level, run_suite
+from imagine_bench.sweep.run import LevelResult, SuiteResult, plan_level, run_suite
+from imagine_bench.sweep.score import Scale
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
 TINY = Suite(
@@ -68,6 +69,26 @@ def test_the_oracle_scores_one_and_who_says_nothing_of_its_model_zero(result):
     assert result.score(by_name["stochasticity"], "oracle").value == pytest.approx(1.0, abs=0.15)
     assert result.score(by_name["stochasticity"], "random").value == pytest.approx(0.0, abs=0.3)
     assert result.score(by_name["uncertainty"], "table").value == 0.0
+
+
+@pytest.mark.parametrize(("measure", "is_of_tests"), [("success", True), ("auroc", False)])
+def test_the_number_of_tests_widens_intervals_of_success_alone(measure, is_of_tests):
+    """An AUROC is no share of the tests: its interval is that over seeds, and one seed has none."""
+    level = Level(name="a", task="arrows")
+    experiment = Experiment(name="a", parameter="p", question="?", levels=(level,), measure=measure)
+    scale = Scale(chance=0.5, optimum=1.0)
+
+    def interval(tests, *values):
+        suite = Suite(name="own", experiments=(experiment,), evaluation_episodes=tests)
+        found = LevelResult(level=level, values=np.array(values), benches=(), scale=scale)
+        score = SuiteResult(suite=suite, agents=("dqn",), levels={("a", "dqn"): (found,)}).score(experiment, "dqn")
+        return score.low, score.high
+
+    assert all(np.isnan(interval(10, 0.8))) != is_of_tests
+    alike = [0.8, 0.8, 0.8, 0.81, 0.8, 0.8, 0.8]
+    few, many = interval(10, *alike), interval(10_000, *alike)
+    assert (few != many) == is_of_tests
+    assert few[0] <= many[0] < many[1] <= few[1]
 
 
 def test_experiments_share_a_level(result):

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 from guest_packages import Guests
 from kept import ROOT
-from recordings import contents, times, view_names
+from recordings import as_text, contents, times, view_names
 from report_pages import page_in_words
 from same_values import assert_same
 from whole_outputs import Expected, short
@@ -292,6 +292,10 @@ def test_a_model_of_theirs_is_judged(said: Said) -> None:
     recorded = said.folder / "judgement.rrd"
     assert {"/action", "/real/frame", "/exact/frame", "/nearest/outcomes"} <= contents(recorded).keys()
     assert times(recorded, "/exact/frame", "depth") == set(range(11))
+    names = registry.task("pick_place").action_names
+    text = as_text(recorded)
+    for depth, action in enumerate(shown(said.folder, _of("exact"))["exact"]["futures_actions"][0], 1):
+        assert f"{depth:02d}: ['**{depth}. {names[action]}**']" in text
     scored = _cells(said, "copy", "exact", "nearest")
     exact, still, theirs = (scored[model, 60] for model in ("exact", "copy", "nearest"))
     assert exact["value_loss"] == exact["value_loss_ruled"] == 0.0
