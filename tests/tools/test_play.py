@@ -177,6 +177,25 @@ def test_a_window_keeps_the_episodes_and_goes_on_where_it_was_closed(keyboard, c
     assert "No episode was finished" in said_after("1"), "no episode more is played"
 
 
+def test_who_comes_back_is_told_how_many_moves_are_left(tmp_path):
+    wanted = protocol_of_player("arrow_puzzle", "person", "anna", tests=2, execution="kinematic")
+    task = registry.task("arrow_puzzle")
+    words = []
+    for comes_back in (False, True):
+        with played_run(wanted, tmp_path) as run:
+            game = KeyboardGame(run, task, None, 0)
+            _, info = game.reset()
+            words.append(game.render()[480:])
+            if not comes_back:
+                start = tuple(info["macrostate"].tolist())
+                going_on = [each for each in range(WAIT) if not task.rules.outcomes(start, each)[0].terminated]
+                until_done(game, going_on[0])
+                words.append(game.render()[480:])
+    begun, left, back = words
+    assert not np.array_equal(begun, left), "one move fewer"
+    np.testing.assert_array_equal(back, left)
+
+
 class Bare(gymnasium.Wrapper):
     """A task by the contract alone, and no more: no scene to look at."""
 

@@ -104,6 +104,15 @@ def test_imagined_episodes_begin_where_real_ones_did() -> None:
     assert distance.shape == (8,) and distance.max() < 0.5, "drawn from the posteriors of starts, whose sigma is 0.05"
 
 
+@pytest.mark.parametrize(("quantile", "least", "most"), [(None, 1.0, 1.0), (0.0, 0.0, 0.3)])
+def test_its_filter_follows_a_quantile_of_real_transitions(quantile: float | None, least: float, most: float) -> None:
+    moving = {"imagination.threshold": 99.0, "imagination.threshold_quantile": quantile}
+    agent = built(model_only.make_uncertainty, {"imagination.model_only_episodes": 60, **moving})
+    live(agent, range(8), np.random.default_rng(0))
+    train_in_model(agent)
+    assert least <= agent.diagnostics()["imagination/acceptance_rate"] <= most
+
+
 def test_exploration_falls_to_that_of_the_settings() -> None:
     agent = practising(CountingModel(), depth=30, exploration=0.2)
     with mock.patch.object(agent.imagination, "act", wraps=agent.imagination.act) as act:

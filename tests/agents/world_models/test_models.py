@@ -161,16 +161,20 @@ def squares(states: Sequence[Sequence[int]]) -> np.ndarray:
     return frames
 
 
-def walked(slip: float, episodes: int = 60) -> Episodes:
-    """Macro-actions 0 and 1 step the color of a square on, but for slips; color 2 of both is rewarded and ends."""
+def walked(slip: float, episodes: int = 60, n_actions: int = 2) -> Episodes:
+    """Macro-actions 0 and 1 step the color of a square on, but for slips; color 2 of both is rewarded and ends.
+
+    A third one steps both on, each with slips of its own.
+    """
     rng = np.random.default_rng(0)
     found = []
     for _ in range(episodes):
         states, actions = [[0, 0]], []
         while len(actions) < 8 and states[-1] != [2, 2]:
-            actions.append(int(rng.integers(2)))
+            actions.append(int(rng.integers(n_actions)))
             after = list(states[-1])
-            after[actions[-1]] = (after[actions[-1]] + (rng.random() >= slip)) % 3
+            for square in ((0,), (1,), (0, 1))[actions[-1]]:
+                after[square] = (after[square] + (rng.random() >= slip)) % 3
             states.append(after)
         ends = [state == [2, 2] for state in states[1:]]
         found.append(
@@ -196,6 +200,14 @@ def test_patches_draws_what_happened_as_often_as_it_did(slip: float) -> None:
     never = model.imagine(ended[None, None], np.array([[2]]), 1, np.random.default_rng(2))
     assert (never.pictures == ended).all() and never.epistemic is not None
     assert never.epistemic[0, 0] == 1.0 > found.epistemic[0, 0], "no transition of this macro-action was seen"
+
+
+def test_patches_draws_each_patch_by_itself() -> None:
+    model = fitted("patches", walked(slip=0.5, n_actions=3))
+    found = model.imagine(squares([[0, 0]])[None], np.array([[2]]), 400, np.random.default_rng(2))
+    moved = found.pictures[0, :, 0, 20, [15, 45], 0] == squares([[1, 1]])[0, 20, [15, 45], 0][:, None]
+    assert moved.mean(axis=1) == pytest.approx(0.5, abs=0.2)
+    assert abs(np.corrcoef(moved)[0, 1]) < 0.25, "one square tells nothing of the other"
 
 
 def test_patches_of_frames_that_never_change_are_none() -> None:

@@ -15,12 +15,16 @@ from fake_codes import ACTIONS, SIZES, agent, frame, live, starts, success
 from imagine_bench_factored.agent import ACCEPTED, FactoredAgent
 from imagine_bench_factored.factors import CodeTransition
 from imagine_bench_factored.model import FactoredModel, Moves, Results
+from imagine_bench_factored.perception import CodePerception
 from imagine_bench_factored.planner import TIE, Planner
 from imagine_bench_factored.settings import DynamicsSettings, FactoredSettings
+from imagine_bench_factored.structured import StructuredModel
 from numpy.typing import NDArray
 
 from imagine_bench.errors import ArtefactError
-from imagine_bench.interfaces import AgentState, Observation
+from imagine_bench.interfaces import AgentContext, AgentState, Observation
+from imagine_bench.interfaces.episodes import joined
+from imagine_bench.seeding import SeedTree
 
 PLANNING = FactoredSettings().planning
 Code = tuple[int, ...]
@@ -51,6 +55,32 @@ def test_what_an_untried_action_does_is_imagined_as_expected(sizes: Code) -> Non
     stayed = np.mean([not any(following) for following, _ in drawn])
     assert stayed == pytest.approx(np.prod([chance[0] for chance in expected]), abs=0.1) and stayed < 0.8
     assert all(not any(model.sample(code, 0, rng)[0]) for _ in range(20)), "seen to stay"
+
+
+def test_by_chance_imagined_factors_change_independently() -> None:
+    """Every factor goes one further in half of all steps: none tells of another, nor of another step or start."""
+    rng = np.random.default_rng(0)
+    found = []
+    for _ in range(100):
+        codes = rng.integers(2, size=(7, len(SIZES))).cumsum(axis=0) % SIZES
+        found.append(
+            {
+                "frames": np.stack([frame(code) for code in codes.tolist()]), "actions": [0] * 6, "rewards": [-1.0] * 6,
+                "terminated": [False] * 6, "truncated": [False] * 5 + [True], "success": False,
+                "action_masks": np.ones((7, ACTIONS), dtype=np.int8),
+            }
+        )  # fmt: skip
+    context = AgentContext(n_actions=ACTIONS, preprocessing="gray_strips", encoder=None, seeds=SeedTree(0))
+    model = StructuredModel(CodePerception(fake_codes.FakeCodes(), factored=True), context)  # type: ignore[arg-type]
+    model.fit(joined(found), rng)
+    begun = np.array([(0, 1, 0), (2, 1, 1)])
+    asked = np.stack([frame(code) for code in begun.tolist()])[:, None], np.zeros((2, 3), dtype=np.int64)
+    reached = model.imagine(*asked, 400, rng).pictures[..., 0, : len(SIZES)].astype(int)  # [start, future, step, P]
+    before = np.concatenate([np.broadcast_to(begun[:, None, None], (2, 400, 1, 3)), reached[:, :, :-1]], axis=2)
+    changes = (reached != before).swapaxes(0, 1).reshape(400, -1)
+    assert changes.mean(axis=0) == pytest.approx(0.5, abs=0.15)
+    between = np.corrcoef(changes, rowvar=False)
+    assert np.abs(between - np.eye(len(between))).max() < 0.25
 
 
 def _backed_up(code: Code, action: int, values: dict[Code, float]) -> float:

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 from imagine_bench_motion import flat
@@ -82,6 +83,25 @@ def test_an_agent_hears_of_episodes_and_trains_before_tests() -> None:
     assert agent.told == ["begin", "explore", "learn", "model", "model", "model", "begin", "test", "begin", "test"]
 
 
+def test_training_counts_faults_and_what_changes_nothing() -> None:
+    """One changes a cube, the next one nothing, and two are faults: what a fault changes is not counted."""
+
+    def info(macrostate: int, fault: bool = False) -> dict[str, Any]:
+        return {"macrostate": np.array([macrostate]), "sim_time_s": 2.0, "fault": fault, "is_success": False}
+
+    steps = iter([info(1), info(1), info(1, fault=True), info(2, fault=True)])
+    frame = np.zeros((64, 64, 3), dtype=np.uint8)
+    env: Any = SimpleNamespace(
+        reset=lambda seed: (frame, info(0)), step=lambda _: (frame, 0.0, False, False, next(steps))
+    )
+    test_env: Any = SimpleNamespace(
+        reset=lambda seed: (frame, info(0)), step=lambda _: (frame, 0.0, True, False, info(0))
+    )
+    agent: Any = _Rememberer()
+    (point,) = learn(env, test_env, agent, budgets=[1], tests=1, horizon=4, seed=0, told=lambda point: None)
+    assert (point.macro_actions, point.nothing, point.faults, point.robot_s) == (4, 1, 2, 8.0)
+
+
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
@@ -150,6 +170,44 @@ def test_sac_has_whole_tests_and_counted_training_faults(settings: str) -> None:
     ends = [(True, False), (False, True), (False, True), (False, False)]
     counts.add([{"fault": fault, "is_success": success} for fault, success in ends])
     assert (counts.faults, counts.successes) == (1, 2)
+
+
+class _Scripted(gymnasium.Env[Any, Any]):
+    """Episodes of three periods: each test is of the given kind, each training episode ends in a fault."""
+
+    observation_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+    period_s = 0.5
+
+    def __init__(self, *tests: str) -> None:
+        self.tests = tests
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        place = (seed or 0) - 10**9
+        self.kind = self.tests[place] if place >= 0 else "fault"
+        self.periods = 0
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.periods += 1
+        over = self.periods == 3
+        info = {
+            "event": self.kind in ("touch", "success") and self.periods == 2,
+            "fault": self.kind == "fault" and over,
+            "is_success": self.kind == "success" and over,
+        }
+        return np.zeros(2, np.float32), 5.0 * info["is_success"] - 1.0, False, over, info
+
+
+def test_each_test_of_sac_counts_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An event or a success belongs to its own episode, and to none of those after it."""
+    kinds = ("nothing", "touch", "nothing", "success", "nothing")
+    monkeypatch.setattr(flat, "flat_env", lambda: _Scripted(*kinds))
+    curve = flat.learn(6, seed=3, every=3, tests=5, told=lambda point: None)
+    assert [(point.touched, point.successes, point.tests) for point in curve] == [(2, 1, 5)] * 2
+    assert [point.mean_return for point in curve] == pytest.approx([-3.0 + 5.0 / 5] * 2)
+    assert [(point.train_faults, point.train_successes) for point in curve] == [(1, 0), (2, 0)]
 
 
 def test_kept_numbers_of_the_page_are_those_of_the_kept_files() -> None:

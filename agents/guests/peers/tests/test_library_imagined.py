@@ -128,3 +128,23 @@ def test_imagined_episodes_follow_real_ones_once_they_may() -> None:
     assert kinds == "r" + "riii" * 3 + "r"
     assert learner.real.added == real == 10 and learner.updates == 10 * 2, "imagined ones teach the model nothing"
     assert 0.0 <= learner.meters.read()["imagination/acceptance_rate"] <= 1.0
+
+
+@pytest.mark.parametrize(("quantile", "least", "most"), [(None, 1.0, 1.0), (0.5, 0.2, 0.8), (0.0, 0.0, 0.2)])
+def test_the_filter_follows_a_quantile_of_real_transitions(quantile: float | None, least: float, most: float) -> None:
+    from imagine_bench_peers.mixed_experience import MixedExperience
+
+    moving = {"imagination.threshold": 99.0, "imagination.threshold_quantile": quantile}
+    learner = built(imagination_agents.make_uncertainty, {"imagination.depth": 1, **moving})
+    env = MixedExperience(Ring(), learner, count=20, seed=1)
+    rng = np.random.default_rng(0)
+    accepted = []
+    for episode in range(100):
+        env.reset(seed=None if episode else 0)
+        over = False
+        while not over:
+            _, _, terminated, truncated, info = env.step(int(rng.integers(ACTIONS)))
+            over = terminated or truncated
+        if info["imagined"]:
+            accepted.append(info["accepted"])
+    assert len(accepted) > 80 and least <= np.mean(accepted) <= most

@@ -168,13 +168,18 @@ def test_a_player_comes_back_to_another_server(tmp_path: Path) -> None:
     with served(tmp_path) as one:
         start = told(SPEC, ask(one, "/reset", ann)[1])
         going_on = [action for action in range(6) if not SPEC.rules.outcomes(start, action)[0].terminated]
-        ask(one, "/step", {**ann, "action": going_on[0]})
+        said = ask(one, "/step", {**ann, "action": going_on[0]})[1]["observation"]["words"]
+        assert f"{SPEC.horizon - 1} macro-actions are left." in said
         with served(tmp_path) as other:
             status, said = ask(other, "/reset", ann)
             assert status == 409 and "in use by process" in said["error"]
     with served(tmp_path) as one:
-        words = ask(one, "/reset", ann)[1]["observation"]["words"]
-        assert "It goes on after 1 macro-actions." in words
+        back = ask(one, "/reset", ann)[1]
+        assert "It goes on after 1 macro-actions." in back["observation"]["words"]
+        here = told(SPEC, back)
+        going_on = [action for action in range(6) if not SPEC.rules.outcomes(here, action)[0].terminated]
+        said = ask(one, "/step", {**ann, "action": going_on[0]})[1]["observation"]["words"]
+        assert f"{SPEC.horizon - 2} macro-actions are left." in said
         play_all(one, "ann")
     played_bench(tmp_path, "ann")
 
