@@ -86,7 +86,8 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
             max_episode_steps = require_integer("max_episode_steps", max_episode_steps, 1)
         self._pools: dict[int, ThreadPoolExecutor] = {}
         self._horizon = max_episode_steps
-        self.metadata = {"render_modes": ["rgb_array"], "render_fps": 1, "autoreset_mode": self.autoreset_mode}
+        fps = lanes[0].metadata["render_fps"]
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": fps, "autoreset_mode": self.autoreset_mode}
         mode = lanes[0].render_mode
         self.render_mode = None if mode is None else require_known("render mode", mode, ("rgb_array",))
         self.single_observation_space = lanes[0].observation_space

@@ -205,14 +205,14 @@ class MotionEnv(SceneEnv):
         if not isinstance(told, (bool, np.bool_)):
             raise InvalidValueError(f"told is {brief(told)}; give True or False.")
         self._told = bool(told)
-        is_number = isinstance(placement, Real) and not isinstance(placement, bool)
-        if not is_number or not 0.0 <= placement <= MAX_PLACEMENT_M:
+        if not isinstance(placement, Real) or isinstance(placement, bool) or not 0.0 <= placement <= MAX_PLACEMENT_M:
             raise InvalidValueError(f"placement is {brief(placement)}; give metres from 0 to {MAX_PLACEMENT_M:g}.")
         self.placement_m = float(placement)
         self._sight = spec.sight
         self._lag = spec.sight.lag if spec.sight else 0
         self._n_steps = steps_in_period(rate_hz, self.model.opt.timestep)
         self.period_s = self._n_steps * self.model.opt.timestep
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.period_s)}
         self.controls = HandControl(control, ArmModel(), self.period_s)
         self.control_names = self.action_names = self.controls.names
         self.action_space = self.controls.space

@@ -27,6 +27,15 @@ def test_checkers_of_gymnasium_and_stable_baselines_are_content(env_id: str) -> 
     env.close()
 
 
+@pytest.mark.parametrize(("rate_hz", "images"), [(25, 25), (125, 125), (62.5, 62), (12.5, 12)])
+def test_videos_have_as_many_images_a_second_as_commands(rate_hz: float, images: int) -> None:
+    """Of single environments and of lanes, for what records or plays images in simulated time."""
+    options = {"rate_hz": rate_hz, "observation": "proprio", "render_mode": "rgb_array"}
+    one = gymnasium.make("imagine_bench/ArrowPuzzleEasyMotion-v0", **options)
+    many = gymnasium.make_vec("imagine_bench/ArrowPuzzleEasyMotion-vector-v0", num_envs=1, **options)
+    assert [env.metadata["render_fps"] for env in (one, many)] == [images] * 2
+
+
 @pytest.mark.parametrize(
     ("control", "action", "periods", "limit"),
     [
