@@ -226,7 +226,7 @@ class MotionEnv(SceneEnv):
             if not isinstance(time_limit_s, Real) or isinstance(time_limit_s, bool) or not time_limit_s > 0:
                 raise InvalidValueError(f"time_limit_s is {brief(time_limit_s)}; give seconds above 0, or None.")
             self.time_limit_s = float(time_limit_s)
-        own = (slip, told, self.placement_m, reward, *((observation, size) if self._lag else ()))  # a state holds late ones
+        own = (slip, told, self.placement_m, reward, *((observation, size) if self._lag else ()))  # which a state holds
         self._kind = (spec.id, "motion", control, self._n_steps, level.name, self.physics, *own)
         self.episode = Episode()
 
