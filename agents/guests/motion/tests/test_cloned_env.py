@@ -119,6 +119,12 @@ def test_another_execution_or_macro_action_is_refused() -> None:
         CloneExecutedEnv(clone=environment().clone).step(0)
 
 
+def test_a_macro_action_has_no_dense_reward() -> None:
+    """It would be that of the period of its event alone."""
+    with pytest.raises(InvalidValueError, match="rewarded as the rules say; leave out reward"):
+        CloneExecutedEnv(reward="dense")
+
+
 def test_the_bench_knows_the_task_with_the_rules_of_the_arrow_puzzle() -> None:
     cloned, puzzle = task("arrow_puzzle_cloned"), task("arrow_puzzle")
     assert task_entry("arrow_puzzle_cloned").env_id == cloned.env_id
