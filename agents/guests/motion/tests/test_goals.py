@@ -117,9 +117,11 @@ def test_every_control_task_has_a_goal_id_of_its_own() -> None:
     assert env.action_space.shape == (8,)
 
 
-def test_goals_of_images_are_refused() -> None:
+def test_goals_of_images_and_other_rewards_are_refused() -> None:
     with pytest.raises(InvalidValueError, match="vectors"):
         make("arrow_puzzle", observation="hand,proprio")
+    with pytest.raises(InvalidValueError, match="0 at the goal and -1 elsewhere; leave out reward"):
+        make("arrow_puzzle", reward="dense")
 
 
 @pytest.mark.parametrize("hides", ["gesture=0.5", "lag=1"])

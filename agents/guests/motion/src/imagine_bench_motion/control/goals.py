@@ -34,13 +34,16 @@ class GoalEnv(gymnasium.Wrapper[Observed, Any, Observed, Any]):
         env: Whose observation has vectors only: parts of ``proprio``, ``objects`` and ``state``.
 
     Raises:
-        InvalidValueError: Images among the observed parts, or a world whose images hide something or are late.
+        InvalidValueError: Images among the observed parts, a world whose images hide something or are late, or a dense
+            reward.
     """
 
     def __init__(self, env: MotionEnv) -> None:
         super().__init__(env)
         if env.task.sight is not None:
             raise InvalidValueError("Goals say what the scene is like now; give a world without gesture and lag.")
+        if env.reward != "sparse":
+            raise InvalidValueError("The reward is 0 at the goal and -1 elsewhere; leave out reward.")
         parts = env.observation_space
         self._names: tuple[str, ...] = tuple(parts.spaces) if isinstance(parts, gymnasium.spaces.Dict) else ()
         spaces = [parts[name] for name in self._names] if self._names else [parts]
