@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import TaskSpec
 
 from ..arrows import spec as arrows
@@ -19,11 +18,6 @@ from ..specs import world_maker
 
 if TYPE_CHECKING:
     from .env import MotionEnv
-
-_MEANINGLESS = {
-    "shuffle": "the order of macro-actions, of which a hand knows none",
-    "coupling": "that a macro-action turns two cubes, which one hand cannot at once",
-}
 
 
 def make_arrows(**options: Any) -> MotionEnv:
@@ -48,9 +42,7 @@ def _make(kind: type[WorldParameters], spec_of: Callable[..., TaskSpec], options
     from .instructions import instruction  # noqa: PLC0415  (likewise)
 
     world = kind.taken_from(options, MotionEnv.KEYWORDS)
-    for name, means in _MEANINGLESS.items():
-        if getattr(world, name, None) != getattr(kind, name, None):
-            raise InvalidValueError(f"{name}={getattr(world, name)} says {means}; leave it out at this level.")
+    world.require_motion()
     task = spec_of(**vars(replace(world, slip=0.0)))
     make_world = functools.partial(world_maker(world), control=True)
     return MotionEnv(task, make_world, instruct=functools.partial(instruction, task), slip=world.slip, **options)
