@@ -154,7 +154,7 @@ def _with_best_known(rows: dict[str, str], task: str) -> dict[str, str]:
 
 def _require_motion(spec: TaskSpec) -> None:
     """Raise InvalidValueError: the task's world has a parameter that has no meaning in continuous control."""
-    world = getattr(spec.rules, "world", None)
+    world: Any = getattr(spec.rules, "world", None)
     if hasattr(world, "require_motion"):
         world.require_motion()
 

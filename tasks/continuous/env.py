@@ -205,7 +205,8 @@ class MotionEnv(SceneEnv):
         if not isinstance(told, (bool, np.bool_)):
             raise InvalidValueError(f"told is {brief(told)}; give True or False.")
         self._told = bool(told)
-        if not isinstance(placement, Real) or isinstance(placement, bool) or not 0.0 <= placement <= MAX_PLACEMENT_M:
+        is_number = isinstance(placement, Real) and not isinstance(placement, bool)
+        if not is_number or not 0.0 <= placement <= MAX_PLACEMENT_M:
             raise InvalidValueError(f"placement is {brief(placement)}; give metres from 0 to {MAX_PLACEMENT_M:g}.")
         self.placement_m = float(placement)
         self._sight = spec.sight
@@ -345,8 +346,7 @@ class MotionEnv(SceneEnv):
         """The present efforts of the servos: torques of the seven joints (N m), forces of both fingers (N). Shape
         (9,).
         """
-        forces: Floats = self.data.actuator_force[self.columns.ctrl].copy()
-        return forces
+        return np.asarray(self.data.actuator_force[self.columns.ctrl])
 
     def get_state(self) -> MotionState:
         """All that decides how the episode goes on, copied; of a wrapper it knows nothing."""
