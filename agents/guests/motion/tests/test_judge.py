@@ -45,7 +45,8 @@ FEW = MotionJudgement(task="arrow_puzzle", models=("no_change",), sizes=(3,), se
 
 def test_a_world_has_one_name_however_it_is_typed() -> None:
     one, other = (
-        dataclasses.replace(FEW, task=f"arrows:{typed}") for typed in ("cubes=2,goal_change=0.1", "goal_change=0.1,cubes=2")
+        dataclasses.replace(FEW, task=f"arrows:{typed}")
+        for typed in ("cubes=2,goal_change=0.1", "goal_change=0.1,cubes=2")
     )
     assert one == other
     assert one.folder_name == other.folder_name

@@ -75,8 +75,8 @@ class MotionJudgement:
             )
         if registry.task_entry(self.task).options.get("slip"):
             raise InvalidValueError(
-                f"Chance decides where a motion of {self.task} ends, and the simulator's one end is taken for the truth. "
-                "Judge a task without the parameter slip."
+                f"Chance decides where a motion of {self.task} ends, and one end of the simulator is taken for the "
+                "truth. Judge a task without the parameter slip."
             )
         if not self.models or not self.seeds or min(self.seeds) < 0:
             raise InvalidValueError("There is nothing to judge; give at least one model and one seed of at least 0.")
