@@ -114,8 +114,8 @@ class SceneEnv(FilmedScene, gymnasium.Env[Observed, Any]):
         if registered is not None and limit not in (None, self.task.horizon):
             horizon = self.task.horizon
             raise InvalidValueError(
-                f"{registered.id} ends after {limit} macro-actions, so leave out horizon={horizon}: give "
-                f"max_episode_steps={horizon}, or make imagine_bench/Arrows-v0."
+                f"{registered.id} ends after {limit} macro-actions, so leave out horizon={horizon} and give "
+                f"max_episode_steps={horizon}."
             )
 
     def step(self, action: Any) -> tuple[Observed, float, bool, bool, Info]:

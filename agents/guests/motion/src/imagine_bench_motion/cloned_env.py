@@ -157,6 +157,7 @@ class CloneExecutedEnv(gymnasium.Env[Frame, np.int64]):
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Frame, Info]:
         """Start an episode; see :meth:`imagine_bench.tasks.continuous.env.MotionEnv.reset`."""
+        self.motion.require_limit(self.spec)
         super().reset(seed=seed)
         self._seen, self._latest = self.motion.reset(seed=seed, options=options)
         self._periods = 0
