@@ -76,7 +76,7 @@ class DatasetCommand:
     encoder: EncoderWord = None
     """The encoder the agent of a run saw through, where it is not bundled."""
     describe: File = None
-    """Folder of a dataset to check and describe, instead of collecting one."""
+    """Folder of a dataset to describe, instead of collecting one. 'verify' checks one of continuous control."""
     standard: bool = False
     """Make random, medium and optimal sets of three control tasks, kinematic, below --out (default: datasets)."""
 

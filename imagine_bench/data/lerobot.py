@@ -187,6 +187,7 @@ def _motion_part(episode: Arrays, before: Mapping[str, int], tasks: dict[str, in
 
 def read_motion(folder: Path) -> Iterator[Arrays]:
     """Read demonstrations, one at a time. Raises ArtefactError: damaged, not whole, or not of our columns."""
+    info = read_json(folder / _INFO, "the metadata of a LeRobot dataset")
     with reading(folder, f"a LeRobot dataset of demonstrations, version {_VERSION}"):
         tasks = pq.read_table(folder / "meta/tasks.parquet")
         said = np.array(tasks[_INDEX].to_pylist())[np.argsort(tasks["task_index"].to_numpy())]
@@ -194,7 +195,10 @@ def read_motion(folder: Path) -> Iterator[Arrays]:
             table = pq.read_table(file)
             lengths = np.unique(table[_EPISODE].to_numpy(), return_counts=True)[1]
             for begin, length in zip(np.cumsum(lengths) - lengths, lengths, strict=True):
-                yield _motion_arrays(table.slice(begin, length), said)
+                rows = table.slice(begin, length)
+                times = {name: rows[name].to_numpy() for name in ("timestamp", "frame_index")}
+                _require_on_time(times, np.arange(length), info["fps"])
+                yield _motion_arrays(rows, said)
 
 
 def _motion_arrays(rows: pa.Table, said: Array) -> Arrays:
@@ -363,16 +367,20 @@ def _lengths(column: Mapping[str, Array], info: Mapping[str, Any]) -> Ints:
     if len(lengths) != info["total_episodes"]:
         raise InvalidValueError(f"{info['total_episodes']} episodes are said to be in it and {len(lengths)} are")
     count = np.arange(len(which)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
-    on_time = np.abs(column["timestamp"] - count / info["fps"]) <= _TOLERANCE_S + 1e-6 * count
+    _require_on_time(column, count, info["fps"])
+    if not np.array_equal(column["action"].astype(np.int64), column["action"]):
+        raise InvalidValueError("an action is no integer")
+    return lengths
+
+
+def _require_on_time(column: Mapping[str, Any], count: Ints, fps: float) -> None:
+    """Raise InvalidValueError if a row's number in its episode is not ``count``, or its time is not that of ``fps``."""
+    on_time = np.abs(column["timestamp"] - count / fps) <= _TOLERANCE_S + 1e-6 * count
     wrong = np.flatnonzero(~on_time | (column["frame_index"] != count))
     if len(wrong):
         row = int(wrong[0])
         found = f"frame_index {column['frame_index'][row]} and timestamp {column['timestamp'][row]:g}"
-        wanted = f"row {count[row]} of its episode, at {info['fps']} a second"
-        raise InvalidValueError(f"row {row} has {found}, but is {wanted}")
-    if not np.array_equal(column["action"].astype(np.int64), column["action"]):
-        raise InvalidValueError("an action is no integer")
-    return lengths
+        raise InvalidValueError(f"row {row} has {found}, but is row {count[row]} of its episode, at {fps} a second")
 
 
 def _ends(folder: Path, digests: list[str]) -> pa.Table:

@@ -23,7 +23,7 @@ import numpy as np
 
 from imagine_bench import registry
 from imagine_bench.data.folder import write_dataset
-from imagine_bench.errors import ImagineBenchError
+from imagine_bench.errors import ImagineBenchError, UnableError
 from imagine_bench.interfaces import Agent, Observation, Transition
 from imagine_bench.interfaces.capabilities import ExternalTrainer, begin_episode
 from imagine_bench.interfaces.environments import Env
@@ -36,12 +36,12 @@ from imagine_bench.running.evaluation import play
 from imagine_bench.running.run_state import Counters, Run, make_env
 from imagine_bench.store import encoders
 from imagine_bench.testing.checks import CheckedAgent, NotOffered, greedy, require, same_arrays
-from imagine_bench.values import Setting
 
 _EPISODES = 2
 _TESTS = 4
 """Test episodes of an agent whose training is a library's or none: some end with their first macro-action."""
 Changes = Mapping[str, Any]
+_Items = tuple[tuple[str, Any], ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,8 +81,9 @@ OPTION_ROWS: Mapping[str, OptionRow] = {
     "transfer": OptionRow(fields=("after", "after_episodes"), changes={"after": (_TASK,), "after_episodes": 1}),
     "unannounced": OptionRow(
         fields=("unannounced",),
-        without={"after": (_TASK,), "after_episodes": 2},
-        changes={"after": (_TASK,), "after_episodes": 2, "unannounced": True},
+        without={"after": (_TASK,), "after_episodes": 8},
+        changes={"after": (_TASK,), "after_episodes": 8, "unannounced": True},
+        episodes=8,
     ),
     "split": OptionRow(fields=("split",), changes={"split": "plan_length=1"}, shown=True),
     "physics": OptionRow(
@@ -147,22 +148,31 @@ class CheckedOptions:
         """Raise InvalidValueError if the option changes nothing; NotOffered, with the sentence, if it is refused."""
         row = OPTION_ROWS[option]
         try:
-            base = self.run(self.task, tuple(row.without.items()), row.episodes)
-            changed = self.run(self._task_of(row), tuple(self._given(row).items()), row.episodes)
+            changed = self.run(self._task_of(row), self._given(row), row.episodes)
+            base = self._without(row)
         except ImagineBenchError as refusal:
             raise NotOffered(f"it is refused: {refusal}") from refusal
         effect = base != changed if row.shown else base.learned != changed.learned
         require(effect, f"{option} changes nothing that {self.agent} does, earns or learns")
 
-    def _given(self, row: OptionRow) -> Changes:
+    def _without(self, row: OptionRow) -> _Left:
+        """The run that the option's is compared with: one without any option where the row's own is refused."""
+        try:
+            return self.run(self.task, self._in_task(row.without), row.episodes)
+        except UnableError:
+            return self.run(self.task, (), row.episodes)
+
+    def _given(self, row: OptionRow) -> _Items:
         if "dataset" in row.changes:
-            return {"dataset": _dataset(self.task)}
-        if "after" in row.changes:
-            return {**row.changes, "after": (self.task,)}
+            return self._in_task({"dataset": _dataset(self.task)})
         if row.world and self.entry.needs_encoder:  # that of the task: one of its own would have to be trained
             encoder = encoders.own(registry.task(self.task), "clean", self.entry.encoder_kind)
-            return {**row.changes, "encoder": str(encoder)}
-        return row.changes
+            return self._in_task({**row.changes, "encoder": str(encoder)})
+        return self._in_task(row.changes)
+
+    def _in_task(self, changes: Changes) -> _Items:
+        """The values of a bench, with the task that is checked as the one that comes before."""
+        return tuple({**changes, "after": (self.task,)}.items() if "after" in changes else changes.items())
 
     def _task_of(self, row: OptionRow) -> str:
         if not row.world:
@@ -174,7 +184,7 @@ class CheckedOptions:
             raise NotOffered(f"{base} has no such option")
         return f"{self.task}{',' if ':' in self.task else ':'}{row.world}"
 
-    def _run(self, task: str, changes: tuple[tuple[str, Setting], ...], episodes: int) -> _Left:
+    def _run(self, task: str, changes: _Items, episodes: int) -> _Left:
         """The results of some episodes of training, or of tests for one that learns nothing, as a digest."""
         given: dict[str, Any] = {"execution": registry.task(task).executions[-1], **dict(changes)}
         wanted, paths = plan_control(

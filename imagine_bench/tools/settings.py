@@ -28,17 +28,20 @@ _WIDTH = 100
 
 
 def settings_in_words(target: str, cases: Cases) -> str:
-    """Two lines or more for each setting; its meaning is the comment on it in the source.
+    """Two lines or more for each setting that has an effect; its meaning is the comment on it in the source.
 
     Args:
         target: The ``"module:attr"`` of the settings, as of :class:`.AgentEntry`.
         cases: Where the settings have which values.
     """
-    resolve = registry.load(target).resolve
-    settings = {words: resolve(name, {}, group) for words, (name, group) in cases.items()}
+    known = registry.load(target)
+    inert = known.inert() if hasattr(known, "inert") else ()
+    settings = {words: known.resolve(name, {}, group) for words, (name, group) in cases.items()}
     values = {words: dotted(dataclasses.asdict(each)) for words, each in settings.items()}
     lines = []
     for name, meaning in _meanings(settings[""], ""):
+        if name in inert:  # a bench refuses another value
+            continue
         default = values[""][name]
         others = [f"{words}: {_typed(of[name])}" for words, of in values.items() if of[name] != default]
         elsewhere = f" ({'; '.join(others)})" if others else ""

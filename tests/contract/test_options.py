@@ -73,6 +73,11 @@ def test_every_option_of_training_has_an_effect_or_is_refused(agent: str) -> Non
     refusals(agent, [name for name, row in OPTION_ROWS.items() if not row.shown])
 
 
+@pytest.mark.parametrize("agent", ["dqn", "factored"])
+def test_a_change_without_notice_has_an_effect(agent: str) -> None:
+    assert not refusals(agent, ["unannounced"])
+
+
 @pytest.mark.parametrize("agent", AGENTS)
 def test_every_option_of_the_world_has_an_effect_or_is_refused(agent: str) -> None:
     refused = refusals(agent, [name for name, row in OPTION_ROWS.items() if row.shown])

@@ -165,3 +165,29 @@ def test_the_arm_does_touch_what_is_in_its_way():
         found = touching(env.model, mujoco.MjData(env.model), qpos, names)
         assert {name for pair in found for name in pair} >= ({expected, "table_top"} if expected else set())
         assert bool(found) == bool(expected)
+
+
+def deepest_in_hand_m(level, actions):
+    """How far parts of the fingers are inside the human's pointing hand at most, in random macro-actions."""
+    env, rng, deepest_m = make("arrow_puzzle", appearance=level), np.random.default_rng(5), 0.0
+    env.capture_motion_hz = 50.0
+    hand = env.model.geom("hand_skin").id
+    fingers = [index for index in range(env.model.ngeom) if env.model.geom(index).name.startswith("finger_")]
+    for step in range(actions):
+        env.reset(seed=step)
+        hands = env.data.mocap_pos.copy(), env.data.mocap_quat.copy()
+        env.step(int(rng.integers(env.action_space.n)))
+        data = mujoco.MjData(env.model)
+        data.mocap_pos[:], data.mocap_quat[:] = hands
+        for data.qpos[:] in env.latest.motion.qpos:
+            mujoco.mj_kinematics(env.model, data)
+            near_m = [mujoco.mj_geomDistance(env.model, data, hand, part, 0.01, None) for part in fingers]
+            deepest_m = max(deepest_m, -min(near_m))
+    return deepest_m
+
+
+@pytest.mark.parametrize("actions", [40, pytest.param(2_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("level", "most_m"), [("clean", 0.0025), ("mild", 0.009), ("strong", 0.016)])
+def test_the_pointing_hand_gives_way_to_a_finger(level, most_m, actions):
+    """As docs/reference/physics.md says; it does come to that."""
+    assert 0.0 < deepest_in_hand_m(level, actions) < most_m

@@ -19,6 +19,7 @@ from imagine_bench_factored.perception import CodePerception
 from imagine_bench import registry, rules
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Observation, Transition
+from imagine_bench.running.bench import plan
 from imagine_bench.seeding import SeedTree
 
 PERCEPTION = CodePerception(fake_codes.FakeCodes(), factored=False)  # type: ignore[arg-type]
@@ -125,6 +126,21 @@ def test_directed_exploration_ends_in_greedy_actions() -> None:
         values = learner.q_values(seen)
         assert values[learner.act(seen, explore=True)] == pytest.approx(values.max())
     assert fake_codes.success(learner) == 1.0
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_epsilons_do_not_change_directed_exploration(value: float) -> None:
+    """So no bench of such an agent takes one."""
+    both = ({}, {f"controller.epsilon_{name}": value for name in ("min", "max", "decay")})
+    settings = [HYPERPARAMETERS.resolve("fast", own, "chapter_5") for own in both]
+    learners = [CodeCountTableAgent(PERCEPTION, ACTIONS, each, SeedTree(0), directed=True) for each in settings]
+    first, second = (live(learner, range(20), np.random.default_rng(1)) for learner in learners)
+    assert first == second
+    for agent in ("count_table_directed", "count_table_own", "elimination", "posterior_sampling"):
+        assert registry.inert_settings(agent) == both[1].keys()
+        with pytest.raises(InvalidValueError, match=f"controller.epsilon_min has no effect on agent {agent}"):
+            plan("arrow_puzzle", "smoke", agents=(f"{agent}:controller.epsilon_min=0.1",))
+    assert not registry.inert_settings("count_table")
 
 
 def test_every_transition_is_counted_once_however_often_it_sees_anew() -> None:

@@ -162,6 +162,14 @@ def test_an_image_that_was_changed_is_not_that_of_the_card(tmp_path: Path) -> No
         verify(read_demonstrations(tmp_path / "honest"))
 
 
+def test_rows_at_other_times_than_the_metadata_says_do_not_hold(tmp_path: Path) -> None:
+    kept = written(tmp_path / "set", "lerobot")
+    path = tmp_path / "set/meta/info.json"
+    path.write_text(path.read_text().replace('"fps": 25', '"fps": 24'))
+    with pytest.raises(ArtefactError, match=r"row 1 has frame_index 1 and timestamp 0.04, but is .* at 24 a second"):
+        verify(kept)
+
+
 def test_the_command_says_whether_a_folder_holds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     answers = {}
     for name, changes in (("honest", {}), ("forged", FORGERIES["a reward"]())):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from imagine_bench.registry import AgentEntry, WorldModelEntry
 
 _COUNT_TABLE_SETTINGS = "imagine_bench_controls.tabular.settings:HYPERPARAMETERS"
+_DIRECTED_SETTINGS = "imagine_bench_controls.tabular.settings:DIRECTED"
 _POSTERIOR_SETTINGS = "imagine_bench_controls.tabular.settings:POSTERIOR_SAMPLING"
 _Q_LEARNING_SETTINGS = "imagine_bench_controls.tabular.settings:Q_LEARNING"
 _DYNA_Q_SETTINGS = "imagine_bench_controls.tabular.settings:DYNA_Q"
@@ -69,14 +70,14 @@ COUNT_TABLE = AgentEntry(
 )
 COUNT_TABLE_DIRECTED = AgentEntry(
     make="imagine_bench_controls.tabular.count_table:make_directed",
-    settings=_COUNT_TABLE_SETTINGS,
+    settings=_DIRECTED_SETTINGS,
     encoder_kind="codes",
     title="count table, directed",
     description="A control: like count table, but it explores by optimism about untried actions (R-max).",
 )
 COUNT_TABLE_DIRECTED_MACROSTATE = AgentEntry(
     make="imagine_bench_controls.tabular.count_table:make_directed_macrostate",
-    settings=_COUNT_TABLE_SETTINGS,
+    settings=_DIRECTED_SETTINGS,
     encoder_kind="codes",
     needs_encoder=False,
     privileged=True,
@@ -92,7 +93,7 @@ COUNT_TABLE_OWN = AgentEntry(
 )
 ELIMINATION = AgentEntry(
     make="imagine_bench_controls.elimination:make",
-    settings=_COUNT_TABLE_SETTINGS,
+    settings=_DIRECTED_SETTINGS,
     needs_encoder=False,
     privileged=True,
     title="elimination (true state)",

@@ -64,9 +64,12 @@ def _hyperparameters(published: S, *unused: str) -> Hyperparameters[S]:
     return Hyperparameters({"chapter_3": group(FAST_3), "chapter_5": group(FAST_5)})
 
 
+_EPSILONS = tuple(f"controller.epsilon_{name}" for name in ("min", "max", "decay"))
+
 HYPERPARAMETERS = _hyperparameters(CountTableSettings())
-OWN = _hyperparameters(OwnCountTableSettings())
-POSTERIOR_SAMPLING = _hyperparameters(PosteriorSamplingSettings())
+DIRECTED = HYPERPARAMETERS.without(*_EPSILONS)
+OWN = _hyperparameters(OwnCountTableSettings()).without(*_EPSILONS)
+POSTERIOR_SAMPLING = _hyperparameters(PosteriorSamplingSettings()).without(*_EPSILONS)
 DYNA_Q = _hyperparameters(DynaQSettings())
 Q_LEARNING = _hyperparameters(DynaQSettings(table=UpdateSettings(planning_steps=0)), "table.planning_steps")
 """No override makes it plan, so that both can be compared in one bench."""
