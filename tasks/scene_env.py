@@ -10,6 +10,7 @@ from typing import Any, Self
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 
 from imagine_bench.arrays import Frame, Info, Observed, State
 from imagine_bench.errors import InvalidValueError, brief, require_integer, require_known, why
@@ -93,7 +94,8 @@ class SceneEnv(FilmedScene, gymnasium.Env[Observed, Any]):
 
         Raises:
             UnknownNameError: An unknown option.
-            InvalidValueError: A seed that is no integer from 0 on, or not a macrostate of this task.
+            InvalidValueError: A seed that is no integer from 0 on, not a macrostate of this task, or as
+                :meth:`require_limit`.
         """
         info = self.restart(seed=seed, options=options)
         self._show()
@@ -101,8 +103,20 @@ class SceneEnv(FilmedScene, gymnasium.Env[Observed, Any]):
 
     def restart(self, *, seed: int | None = None, options: Info | None = None) -> Info:
         """As :meth:`reset`, without an observation."""
+        self.require_limit(self.spec)
         super().reset(seed=None if seed is None else require_integer("seed", seed, 0))
         return self._begin(self._start(options_of(options)))
+
+    def require_limit(self, spec: EnvSpec | None) -> None:
+        """Raise InvalidValueError: the id that this was made by ends episodes elsewhere than at the world's horizon."""
+        registered = None if spec is None else gymnasium.registry.get(spec.id)
+        limit = None if registered is None else registered.max_episode_steps
+        if registered is not None and limit not in (None, self.task.horizon):
+            horizon = self.task.horizon
+            raise InvalidValueError(
+                f"{registered.id} ends after {limit} macro-actions, so leave out horizon={horizon} and give "
+                f"max_episode_steps={horizon}."
+            )
 
     def step(self, action: Any) -> tuple[Observed, float, bool, bool, Info]:
         """Carry out one action.

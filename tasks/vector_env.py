@@ -86,7 +86,8 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
             max_episode_steps = require_integer("max_episode_steps", max_episode_steps, 1)
         self._pools: dict[int, ThreadPoolExecutor] = {}
         self._horizon = max_episode_steps
-        self.metadata = {"render_modes": ["rgb_array"], "render_fps": 1, "autoreset_mode": self.autoreset_mode}
+        fps = lanes[0].metadata["render_fps"]
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": fps, "autoreset_mode": self.autoreset_mode}
         mode = lanes[0].render_mode
         self.render_mode = None if mode is None else require_known("render mode", mode, ("rgb_array",))
         self.single_observation_space = lanes[0].observation_space
@@ -113,9 +114,11 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
             options: Those of the task, the same for all lanes, and ``reset_mask``, bool of shape (num_envs,).
 
         Raises:
-            InvalidValueError: Seeds or mask of another length or type, or a macrostate that is none.
+            InvalidValueError: Seeds or mask of another length or type, a macrostate that is none, or as
+                :meth:`.SceneEnv.require_limit`.
             UnknownNameError: An unknown option.
         """
+        self.envs[0].require_limit(self.spec)
         options = options_of(options)
         chosen = self._masked(options.pop("reset_mask", None))
         seeds = self._seeds(seed)
@@ -333,7 +336,8 @@ def make(
     Args:
         num_envs: Lanes.
         env: ``"module:attr"`` of the environment's constructor.
-        max_episode_steps: As :class:`MacroVectorEnv`; None leaves the environment's own limit.
+        max_episode_steps: As :class:`MacroVectorEnv`; an environment's own limit ends episodes before, as it does of a
+            single one.
         autoreset_mode: As :class:`MacroVectorEnv`.
         threads: As :class:`MacroVectorEnv`.
         **options: Keyword arguments of the constructor, the same for all lanes.
@@ -344,6 +348,8 @@ def make(
     creator = load_env_creator(env)
     lanes: list[Any] = [creator(**options) for _ in range(require_integer("num_envs", num_envs, 1))]
     if isinstance(lanes[0], TimeLimit):  # one that limits itself
-        max_episode_steps = lanes[0]._max_episode_steps if max_episode_steps is None else max_episode_steps
+        own = lanes[0]._max_episode_steps
+        given = own if max_episode_steps is None else require_integer("max_episode_steps", max_episode_steps, 1)
+        max_episode_steps = min(given, own)
         lanes = [lane.unwrapped for lane in lanes]
     return MacroVectorEnv(lanes, max_episode_steps=max_episode_steps, autoreset_mode=autoreset_mode, threads=threads)

@@ -41,7 +41,8 @@ class SuccessTerminates(Wrapper):
     def __init__(self, env: Env) -> None:
         if not hasattr(env.unwrapped, "agent_view"):
             raise InvalidValueError(f"{env} is no task of imagine_bench; give one.")
-        if env.spec is not None and env.spec.kwargs.get("lag"):
+        sight = getattr(getattr(env.unwrapped, "task", None), "sight", None)
+        if sight is not None and sight.lag:
             raise InvalidValueError("The library records how the scene looks now; give a world without lag.")
         super().__init__(env)
         self._bookkeeping = np.random.default_rng(0)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from imagine_bench import registry
-from imagine_bench.errors import ImagineBenchError, UnknownNameError
+from imagine_bench.errors import ImagineBenchError, InvalidValueError, UnknownNameError
 from imagine_bench.exact import motion
 from imagine_bench.exact.certificate import Certificate, certificate, certificate_rows
 from imagine_bench.interfaces import APPEARANCES, EXECUTIONS, TaskSpec, bundled_name
@@ -89,7 +89,12 @@ def _learner(name: str, entry: AgentEntry | RegressorEntry | WorldModelEntry) ->
 
 
 def describe_task(name: str) -> str:
-    """A control or regression task in words and numbers. Raises as :func:`.registry.task`."""
+    """A control or regression task in words and numbers.
+
+    Raises:
+        UnknownNameError, InvalidValueError: As :func:`.registry.task`, or a parameter that continuous control cannot
+            have, where that is described.
+    """
     if name in registry.regressions():
         data = registry.regression(name)
         rows = {"learned from": f"data, in the variants {', '.join(data.variants)}", "error": data.error_name}
@@ -120,6 +125,7 @@ def describe_task(name: str) -> str:
     }
     hand = _by_hand(spec)
     if registry.task_of_motion(name):
+        _require_motion(spec)
         return _page(spec.title, spec.description, hand | {"rules": "those of its macro-actions:"} | rows)
     return _page(spec.title, spec.description, rows | dict(list(hand.items())[1:2]))
 
@@ -146,10 +152,21 @@ def _with_best_known(rows: dict[str, str], task: str) -> dict[str, str]:
     return {**rows, "best known": text, **cautious}
 
 
+def _require_motion(spec: TaskSpec) -> None:
+    """Raise InvalidValueError: the task's world has a parameter that has no meaning in continuous control."""
+    world: Any = getattr(spec.rules, "world", None)
+    if hasattr(world, "require_motion"):
+        world.require_motion()
+
+
 def _by_hand(spec: TaskSpec) -> dict[str, str]:
     """A task in continuous control, and how far it can be solved; nothing where it has none."""
     base, colon, options = spec.id.partition(":")
     if not registry.has_task(base) or not registry.task_entry(base).motion:
+        return {}
+    try:
+        _require_motion(spec)
+    except InvalidValueError:
         return {}
     made_by = registry.motion_id(registry.task_entry(base).env_id)
     name = registry.motion_name(made_by)

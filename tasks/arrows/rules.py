@@ -65,6 +65,10 @@ class Arrows(WorldParameters):
     FAMILY: ClassVar[str] = "arrows"
     SCENE: ClassVar[str] = "imagine_bench.tasks.arrows.world:ArrowWorld"
     IN_VIEW: ClassVar[tuple[str, ...]] = ("cubes", "distractors")
+    MACRO_ACTIONS_ALONE: ClassVar[Mapping[str, str]] = {
+        "shuffle": "the order of macro-actions, of which a hand knows none",
+        "coupling": "that a macro-action turns two cubes, which one hand cannot at once",
+    }
     RANGES: ClassVar[Mapping[str, tuple[float, float]]] = {
         "cubes": (1, MAX_CUBES),
         "shuffle": (0, 2**32 - 1),

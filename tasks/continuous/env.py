@@ -213,6 +213,7 @@ class MotionEnv(SceneEnv):
         self._lag = spec.sight.lag if spec.sight else 0
         self._n_steps = steps_in_period(rate_hz, self.model.opt.timestep)
         self.period_s = self._n_steps * self.model.opt.timestep
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.period_s)}
         self.controls = HandControl(control, ArmModel(), self.period_s)
         self.control_names = self.action_names = self.controls.names
         self.action_space = self.controls.space
@@ -226,7 +227,7 @@ class MotionEnv(SceneEnv):
             if not isinstance(time_limit_s, Real) or isinstance(time_limit_s, bool) or not time_limit_s > 0:
                 raise InvalidValueError(f"time_limit_s is {brief(time_limit_s)}; give seconds above 0, or None.")
             self.time_limit_s = float(time_limit_s)
-        own = (slip, told, self.placement_m, *((observation, size) if self._lag else ()))  # a state holds late ones
+        own = (slip, told, self.placement_m, reward, *((observation, size) if self._lag else ()))  # which a state holds
         self._kind = (spec.id, "motion", control, self._n_steps, level.name, self.physics, *own)
         self.episode = Episode()
 
@@ -345,8 +346,7 @@ class MotionEnv(SceneEnv):
         """The present efforts of the servos: torques of the seven joints (N m), forces of both fingers (N). Shape
         (9,).
         """
-        forces: Floats = self.data.actuator_force[self.columns.ctrl].copy()
-        return forces
+        return np.asarray(self.data.actuator_force[self.columns.ctrl])
 
     def get_state(self) -> MotionState:
         """All that decides how the episode goes on, copied; of a wrapper it knows nothing."""

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import TaskSpec
+from imagine_bench.interfaces import PhysicsSettings, TaskSpec
 
 from ..arrows import spec as arrows
 from ..arrows.rules import Arrows
@@ -19,11 +19,6 @@ from ..specs import world_maker
 
 if TYPE_CHECKING:
     from .env import MotionEnv
-
-_MEANINGLESS = {
-    "shuffle": "the order of macro-actions, of which a hand knows none",
-    "coupling": "that a macro-action turns two cubes, which one hand cannot at once",
-}
 
 
 def make_arrows(**options: Any) -> MotionEnv:
@@ -43,14 +38,21 @@ def make_pick_place(**options: Any) -> MotionEnv:
     return _make(PickPlace, pick_place.spec_of, options)
 
 
+def _require_no_planner(physics: PhysicsSettings) -> None:
+    for name in ("plan_error_mm", "plan_error_deg", "sense"):
+        if getattr(physics, name) != getattr(PhysicsSettings, name):
+            raise InvalidValueError(
+                f"Physics setting {name} is of the planner of macro-actions, and commands have none; leave it out."
+            )
+
+
 def _make(kind: type[WorldParameters], spec_of: Callable[..., TaskSpec], options: dict[str, Any]) -> MotionEnv:
     from .env import MotionEnv  # noqa: PLC0415  (MuJoCo loads with the first environment)
     from .instructions import instruction  # noqa: PLC0415  (likewise)
 
     world = kind.taken_from(options, MotionEnv.KEYWORDS)
-    for name, means in _MEANINGLESS.items():
-        if getattr(world, name, None) != getattr(kind, name, None):
-            raise InvalidValueError(f"{name}={getattr(world, name)} says {means}; leave it out at this level.")
+    world.require_motion()
+    _require_no_planner(PhysicsSettings.of(options.get("physics", {})))
     task = spec_of(**vars(replace(world, slip=0.0)))
     make_world = functools.partial(world_maker(world), control=True)
     return MotionEnv(task, make_world, instruct=functools.partial(instruction, task), slip=world.slip, **options)

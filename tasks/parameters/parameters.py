@@ -103,6 +103,8 @@ class WorldParameters:
     """Lowest and highest value of each number; integers where these are."""
     NAMED: ClassVar[Mapping[str, str]] = {"goal_change": "fickle"}
     """Parameters that canonical names spell as before, so that kept results keep their worlds; both are read."""
+    MACRO_ACTIONS_ALONE: ClassVar[Mapping[str, str]] = {}
+    """Parameters that continuous control cannot have, and what each says."""
 
     def __post_init__(self) -> None:
         for name, (low, high) in self.RANGES.items():
@@ -138,6 +140,12 @@ class WorldParameters:
     def words(self) -> str:
         """The part of the canonical name that tells values, as a list in a sentence."""
         return str(self).partition(":")[2].replace(",", ", ")
+
+    def require_motion(self) -> None:
+        """Raise InvalidValueError: the world has a parameter that has no meaning in continuous control."""
+        for name, means in self.MACRO_ACTIONS_ALONE.items():
+            if getattr(self, name) != getattr(type(self), name):
+                raise InvalidValueError(f"{name}={getattr(self, name)} says {means}; leave it out at this level.")
 
     @property
     def plainest(self) -> Self:

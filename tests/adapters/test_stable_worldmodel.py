@@ -8,6 +8,7 @@ from __future__ import annotations
 import gymnasium
 import numpy as np
 import pytest
+from imagine_bench.tasks.arrows.spec import make_limited_env
 
 from imagine_bench import registry
 from imagine_bench.adapters.stable_worldmodel import SuccessTerminates
@@ -59,6 +60,7 @@ def test_another_environment_is_one_clear_error():
     for late in (
         gymnasium.make("imagine_bench/Arrows-v0", lag=1),
         gymnasium.make(registry.task("arrows:lag=1").env_id),
+        make_limited_env(lag=1),  # which Gymnasium did not make
     ):
         with pytest.raises(InvalidValueError, match="give a world without lag"):
             SuccessTerminates(late)

@@ -10,11 +10,13 @@ import pytest
 
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
+from imagine_bench.errors import InvalidValueError
 from imagine_bench.exact import motion
 from imagine_bench.exact.motion import certificate, measured
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.rules import shortest_plans, states_of_play, tabulate
 from imagine_bench.statistics import wilson
+from imagine_bench.tools.describe import describe
 
 MANY = 10**9
 MEASURED = sorted(file.stem for file in Path(motion.__file__).parent.glob("measured/*.json"))
@@ -111,3 +113,12 @@ def test_the_command_measures_and_keeps_a_certificate(name: str, tmp_path: Any, 
 def test_a_misspelt_control_task_is_answered_by_the_nearest(name: str, nearest: str, capsys: Any) -> None:
     assert main(["describe", name]) == 2
     assert f"Did you mean '{nearest}'?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["coupling=neighbour", "shuffle=1"])
+def test_no_certificate_of_commands_where_there_are_none(option: str) -> None:
+    """Such a world cannot be made in continuous control."""
+    assert "\nby hand  " in describe("arrows:cubes=2")
+    assert "\nby hand  " not in describe(f"arrows:cubes=2,{option}")
+    with pytest.raises(InvalidValueError, match="leave it out at this level"):
+        describe(f"ArrowsMotion:cubes=2,{option}")

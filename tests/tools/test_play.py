@@ -242,8 +242,10 @@ def test_a_model_brings_its_task_and_its_appearance(keyboard, monkeypatch, tmp_p
 
 @pytest.fixture
 def hand():
-    env = gymnasium.make("imagine_bench/ArrowPuzzleEasyMotion-v0", disable_env_checker=True, size=32, time_limit_s=0.4)
-    with contextlib.closing(HandGame(env, registry.task("arrow_puzzle_easy"), 0)) as game:
+    """In a world in which nearly every macro-action slips; a hand that slips grips again."""
+    options = {"slip": 0.9, "size": 32, "time_limit_s": 0.4}
+    env = gymnasium.make("imagine_bench/ArrowPuzzleEasyMotion-v0", disable_env_checker=True, **options)
+    with contextlib.closing(HandGame(env, registry.task("arrow_puzzle_easy:slip=0.9"), 0)) as game:
         yield game
 
 

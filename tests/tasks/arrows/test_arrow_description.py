@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 
 import gymnasium
@@ -89,3 +90,28 @@ def test_a_world_ends_at_its_own_horizon():
         env = gymnasium.make("imagine_bench/Arrows-v0", goal="toward_agent", execution="kinematic", **options)
         assert env.get_wrapper_attr("_max_episode_steps") == horizon
         env.close()
+
+
+@pytest.mark.parametrize("kind", ["", "-vector"])
+def test_a_horizon_beside_an_id_with_its_own_limit_is_refused(kind):
+    """Gymnasium would go on cutting episodes off after ten macro-actions."""
+    make = functools.partial(gymnasium.make_vec, num_envs=1) if kind else gymnasium.make
+    for horizon in (3, 20):
+        env = make(f"imagine_bench/ArrowPuzzle{kind}-v0", horizon=horizon, execution="kinematic", observation="state")
+        with pytest.raises(InvalidValueError, match=f"-v0 ends after 10 macro-actions.*max_episode_steps={horizon}"):
+            env.reset(seed=0)
+        env.close()
+
+
+@pytest.mark.parametrize(("given", "ends"), [(2, 2), (50, 3)])
+def test_lanes_end_where_a_single_environment_of_a_world_does(given, ends):
+    world = {"goal": "012", "forbid": "none", "horizon": 3, "max_episode_steps": given}
+    options = {"execution": "kinematic", "observation": "state", **world}
+    one = gymnasium.make("imagine_bench/Arrows-v0", **options)
+    many = gymnasium.make_vec("imagine_bench/Arrows-vector-v0", num_envs=1, **options)
+    for env in (one, many):
+        env.reset(seed=0, options={"macrostate": (2, 2, 2, 0)})
+    cut = [(one.step(0)[3], many.step(np.array([0]))[3].item()) for _ in range(ends)]
+    assert cut == [(False, False)] * (ends - 1) + [(True, True)]
+    one.close()
+    many.close()

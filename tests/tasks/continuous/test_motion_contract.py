@@ -12,6 +12,9 @@ from gymnasium.utils.env_checker import check_env
 from imagine_bench.tasks.continuous.controls import WORKSPACE_HIGH_M
 from imagine_bench.tasks.continuous.spec import make_arrows
 
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import PhysicsSettings
+
 IDS = sorted(each for each in gymnasium.registry if re.fullmatch(r"imagine_bench/\w+Motion-v0", each))
 
 
@@ -25,6 +28,23 @@ def test_checkers_of_gymnasium_and_stable_baselines_are_content(env_id: str) -> 
         check_env(env.unwrapped)
         library.check_env(env, warn=True)
     env.close()
+
+
+@pytest.mark.parametrize(("name", "value"), [("plan_error_mm", 5.0), ("plan_error_deg", 5.0), ("sense", "nominal")])
+def test_physics_of_a_planner_is_refused(name: str, value: float | str) -> None:
+    """It would change nothing: a command is carried out as it is."""
+    with pytest.raises(InvalidValueError, match=f"Physics setting {name} is of the planner of macro-actions"):
+        make_arrows(physics={name: value})
+    make_arrows(physics={name: getattr(PhysicsSettings, name), "pad_friction": 0.5}, observation="proprio").close()
+
+
+@pytest.mark.parametrize(("rate_hz", "images"), [(25, 25), (125, 125), (62.5, 62), (12.5, 12)])
+def test_videos_have_as_many_images_a_second_as_commands(rate_hz: float, images: int) -> None:
+    """Of single environments and of lanes, for what records or plays images in simulated time."""
+    options = {"rate_hz": rate_hz, "observation": "proprio", "render_mode": "rgb_array"}
+    one = gymnasium.make("imagine_bench/ArrowPuzzleEasyMotion-v0", **options)
+    many = gymnasium.make_vec("imagine_bench/ArrowPuzzleEasyMotion-vector-v0", num_envs=1, **options)
+    assert [env.metadata["render_fps"] for env in (one, many)] == [images] * 2
 
 
 @pytest.mark.parametrize(

@@ -102,6 +102,21 @@ def test_a_damaged_state_is_refused_and_changes_nothing(name: str) -> None:
         assert pickle.dumps(env.get_state()) == before
 
 
+@pytest.mark.parametrize("reward", ["sparse", "dense"])
+def test_a_state_goes_on_with_the_rewards_that_it_began_with(reward: str) -> None:
+    """The state of a dense reward holds a potential, from which its next reward is counted."""
+    another = "dense" if reward == "sparse" else "sparse"
+    env, alike, other = (make_arrows(observation="proprio", reward=each) for each in (reward, reward, another))
+    for each, seed in ((env, 1), (alike, 2), (other, 3)):
+        each.reset(seed=seed)
+    down = np.array([0, 0, -0.2, 0, 0, 0, 1], dtype=np.float32)
+    env.step(down)
+    alike.set_state(env.get_state())
+    assert alike.step(down)[1] == env.step(down)[1]
+    with pytest.raises(InvalidValueError, match="give one of get_state"):
+        other.set_state(env.get_state())
+
+
 @pytest.mark.parametrize("control", CONTROL_NAMES)
 @pytest.mark.parametrize("family", FAMILIES)
 def test_copies_and_states_in_the_middle_of_a_grasp_go_on_to_the_bit(family: str, control: str) -> None:

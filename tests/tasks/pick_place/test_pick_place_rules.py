@@ -72,3 +72,10 @@ def test_facts_are_those_worked_out_by_hand():
 def test_the_optimal_policy_does_what_is_asked_for():
     for state in PLAY:
         assert RULES.is_asked_for(state, RULES.optimal_action(state))
+
+
+@pytest.mark.parametrize("slip", [0.5, 0.99])
+def test_grips_that_slip_cost_time_and_no_return(slip):
+    """Also where they nearly always slip, so that an episode needs hundreds of macro-actions."""
+    tables = tabulate(registry.task(f"pick_place:slip={slip}").rules)
+    assert optimal_values(tables).max(axis=0)[tables.starts] == pytest.approx(8.0, abs=1e-6)

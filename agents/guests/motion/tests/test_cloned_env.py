@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from dataclasses import replace
 
+import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
@@ -117,6 +118,20 @@ def test_another_execution_or_macro_action_is_refused() -> None:
             environment().step(action)
     with pytest.raises(InvalidValueError, match=r"call reset\(\) first"):
         CloneExecutedEnv(clone=environment().clone).step(0)
+
+
+def test_a_macro_action_has_no_dense_reward() -> None:
+    """It would be that of the period of its event alone."""
+    with pytest.raises(InvalidValueError, match="rewarded as the rules say; leave out reward"):
+        CloneExecutedEnv(reward="dense")
+
+
+def test_another_horizon_than_that_of_the_task_is_refused() -> None:
+    """Gymnasium would go on ending episodes after ten macro-actions."""
+    env_id = task("arrow_puzzle_cloned").env_id
+    env = gymnasium.make(env_id, horizon=3, disable_env_checker=True)
+    with pytest.raises(InvalidValueError, match="ends after 10 macro-actions, so leave out horizon=3"):
+        env.reset(seed=0)
 
 
 def test_the_bench_knows_the_task_with_the_rules_of_the_arrow_puzzle() -> None:

@@ -221,6 +221,13 @@ def test_a_saved_clone_acts_as_before(tmp_path: Path) -> None:
         Clone.load(tmp_path / "other.pt")
 
 
+def test_a_scene_with_other_objects_is_refused_by_a_clone() -> None:
+    clone().begin("turn the left cube clockwise")
+    seen = {"proprio": np.zeros(16, dtype=np.float32), "objects": np.zeros((2, 7), dtype=np.float32)}
+    with pytest.raises(InvalidValueError, match="learned from 37 numbers beside images, and this scene gives 30"):
+        clone().act(seen)
+
+
 @pytest.mark.slow
 def test_a_clone_of_sixty_demonstrations_turns_cubes() -> None:
     data = collect(60, seed=11, observation=VECTORS)

@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from imagine_bench_motion.control import datasets, demonstrator
-from imagine_bench_motion.control.datasets import DemonstrationSettings, demonstration, verify
+from imagine_bench_motion.control.datasets import DemonstrationSettings, collect, demonstration, describe, verify
 
 from imagine_bench import registry
 from imagine_bench.arrays import Arrays, content_hash
@@ -142,6 +142,16 @@ def test_what_does_not_follow_from_the_commands_is_found(tmp_path: Path, forgery
 )
 def test_worlds_with_options_and_chance_replay(tmp_path: Path, task: str) -> None:
     assert verify(written(tmp_path / "set", task=task)).startswith("Holds.")
+
+
+def test_the_optimum_is_that_of_commands_to_which_a_slip_costs_nothing(tmp_path: Path) -> None:
+    """A macro-action that slips is one of the few that an episode has."""
+    options = {"policy": "expert", "episodes": 1, "seed": 0, "appearance": "clean", "size": 32, "workers": 1}
+    kept = collect("arrows:cubes=1,slip=0.9", folder=tmp_path / "set", format="npz", **options)
+    facts = registry.task("arrows:cubes=1").facts()
+    assert (kept.card["optimum"], kept.card["optimal_return"]) == (facts.optimum, facts.optimal_return)
+    assert registry.task(kept.card["task"]).facts().optimum < 0.7
+    assert f"optimum {facts.optimal_return:.2f} if all is seen" in describe(kept)
 
 
 def test_an_image_that_was_changed_is_not_that_of_the_card(tmp_path: Path) -> None:

@@ -73,6 +73,19 @@ def test_a_goal_is_on_the_places_of_the_episode(task: str, start: tuple[int, ...
     assert max(off_m) > WITHIN_M
 
 
+@pytest.mark.parametrize(
+    ("task", "start", "stay"), [("arrow_puzzle", (1, 2, 3, 0), [1, 2]), ("pick_place", (0, 0, 0, 1), [0, 2])]
+)
+def test_what_no_macro_action_moves_is_at_its_goal(task: str, start: tuple[int, ...], stay: list[int]) -> None:
+    """However far off its place it stands: at this appearance up to 14 mm."""
+    goals = make(task, placement=0.04, appearance="strong")
+    for seed in range(3):
+        observation, _ = goals.reset(seed=seed, options={"macrostate": start})
+        now, then = (observation[name].reshape(-1, 5) for name in ("achieved_goal", "desired_goal"))
+        differs = [index for index in range(3) if not np.array_equal(now[index], then[index])]
+        assert differs == [index for index in range(3) if index not in stay]
+
+
 class Unlucky:
     """Rules by which every macro-action ends the episode in a forbidden macrostate, every second time."""
 
@@ -104,9 +117,11 @@ def test_every_control_task_has_a_goal_id_of_its_own() -> None:
     assert env.action_space.shape == (8,)
 
 
-def test_goals_of_images_are_refused() -> None:
+def test_goals_of_images_and_other_rewards_are_refused() -> None:
     with pytest.raises(InvalidValueError, match="vectors"):
         make("arrow_puzzle", observation="hand,proprio")
+    with pytest.raises(InvalidValueError, match="0 at the goal and -1 elsewhere; leave out reward"):
+        make("arrow_puzzle", reward="dense")
 
 
 @pytest.mark.parametrize("hides", ["gesture=0.5", "lag=1"])

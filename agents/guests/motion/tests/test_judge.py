@@ -45,7 +45,8 @@ FEW = MotionJudgement(task="arrow_puzzle", models=("no_change",), sizes=(3,), se
 
 def test_a_world_has_one_name_however_it_is_typed() -> None:
     one, other = (
-        dataclasses.replace(FEW, task=f"arrows:{typed}") for typed in ("cubes=2,slip=0.1", "slip=0.1,cubes=2")
+        dataclasses.replace(FEW, task=f"arrows:{typed}")
+        for typed in ("cubes=2,goal_change=0.1", "goal_change=0.1,cubes=2")
     )
     assert one == other
     assert one.folder_name == other.folder_name
@@ -146,6 +147,7 @@ def test_the_simulator_is_right_a_copy_where_nothing_changes(family: str) -> Non
     ("change", "sentence"),
     [
         ({"task": "arrow_puzzle_cloned"}, "has no continuous control"),
+        ({"task": "arrows:cubes=2,slip=0.1"}, "Chance decides where a motion of arrows:cubes=2,slip=0.1 ends"),
         ({"models": ()}, "There is nothing to judge"),
         ({"models": ("no_change", "no_change")}, "give each once"),
         ({"models": ("patches",)}, "No model of motions 'patches'"),

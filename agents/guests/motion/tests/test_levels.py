@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +16,7 @@ import pytest
 from imagine_bench_motion import flat
 from imagine_bench_motion.__main__ import main
 from imagine_bench_motion.cloned_env import BUNDLED
-from imagine_bench_motion.flat import SETTINGS, EndCounts, Point
+from imagine_bench_motion.flat import EndCounts, Point
 from imagine_bench_motion.levels import CurvePoint, environment, expects_nothing, learn, make_agent, oracle_success
 
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes
@@ -158,13 +159,15 @@ def test_a_kept_file_names_its_clone_and_its_world(tmp_path: Path, monkeypatch: 
     assert str(BUNDLED.parent) not in out.read_text()
 
 
-@pytest.mark.parametrize("settings", SETTINGS)
-def test_sac_has_whole_tests_and_counted_training_faults(settings: str) -> None:
+@pytest.mark.parametrize(("settings", "at_once"), [("library", 4), ("tuned", 8)])
+def test_sac_has_whole_tests_and_counted_training(settings: str, at_once: int) -> None:
+    """Periods of training are those that the library made: 25 or more in whole rounds of collection, twice."""
     told: list[Point] = []
     short = {"reward": "dense", "time_limit_s": 0.4}
     curve = flat.learn(50, seed=3, settings=settings, every=25, tests=1, told=told.append, **short)
-    assert told == curve and [point.steps for point in curve] == [25, 50]
-    assert [point.robot_s for point in curve] == pytest.approx([1.0, 2.0])
+    made = at_once * math.ceil(25 / at_once)
+    assert told == curve and [point.steps for point in curve] == [made, 2 * made]
+    assert [point.robot_s for point in curve] == pytest.approx([0.04 * made, 0.08 * made])
     assert curve[-1].train_faults == curve[-1].train_successes == 0, "no hand reaches a cube in 0.4 s"
     counts = EndCounts()
     ends = [(True, False), (False, True), (False, True), (False, False)]

@@ -120,8 +120,8 @@ class CloneExecutedEnv(gymnasium.Env[Frame, np.int64]):
 
     Raises:
         ArtefactError: No such file.
-        InvalidValueError: Another execution, a clone that does not see proprio and something more, or a world whose
-            images hide something or are late.
+        InvalidValueError: Another execution, a clone that does not see proprio and something more, a world whose images
+            hide something or are late, or a dense reward.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 - Gymnasium's own declaration
@@ -143,6 +143,8 @@ class CloneExecutedEnv(gymnasium.Env[Frame, np.int64]):
         self.motion = skill_env(self.clone.observation, appearance, **{"time_limit_s": 1e9, "size": size, **options})
         if self.motion.task.sight is not None:
             raise InvalidValueError("A clone acts by what it sees now; leave out gesture and lag.")
+        if self.motion.reward != "sparse":
+            raise InvalidValueError("A macro-action is rewarded as the rules say; leave out reward.")
         self.action_names = self.motion.task.action_names
         self.action_space = gymnasium.spaces.Discrete(len(self.action_names))
         view = agent_camera_view()
@@ -155,6 +157,7 @@ class CloneExecutedEnv(gymnasium.Env[Frame, np.int64]):
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Frame, Info]:
         """Start an episode; see :meth:`imagine_bench.tasks.continuous.env.MotionEnv.reset`."""
+        self.motion.require_limit(self.spec)
         super().reset(seed=seed)
         self._seen, self._latest = self.motion.reset(seed=seed, options=options)
         self._periods = 0

@@ -110,10 +110,20 @@ class Clone:
         self._due = []
 
     def act(self, observation: Observed) -> Command:
-        """The command for this period. Shape (8,)."""
+        """The command for this period. Shape (8,).
+
+        Raises:
+            InvalidValueError: A scene with other objects than those of the demonstrations.
+        """
+        seen = numbers_of(observation)
+        if seen.shape != self._inputs.mean.shape:
+            raise InvalidValueError(
+                f"The clone learned from {len(self._inputs.mean)} numbers beside images, and this scene gives "
+                f"{len(seen)}; give one with the objects of its demonstrations."
+            )
         with torch.inference_mode():
             images = {camera: _as_input(image[None]) for camera, image in images_of(observation).items()}
-            numbers = torch.from_numpy(self._inputs.standardised(numbers_of(observation)))[None]
+            numbers = torch.from_numpy(self._inputs.standardised(seen))[None]
             predicted = self.network(images, numbers, self._words)[0].numpy()
         self._due = [rest[1:] for rest in self._due if len(rest) > 1]
         self._due.append(self._commands.restored(predicted))

@@ -72,7 +72,7 @@ def learn(
     """Train SAC, and test its deterministic policy now and then.
 
     Args:
-        steps: Control periods of training.
+        steps: Control periods of training. The library makes a few at once, so before a test there may be some more.
         seed: Of the library and the environments, below 2**31.
         settings: A name of :data:`SETTINGS`.
         every: Steps between tests.
@@ -93,9 +93,9 @@ def learn(
     counts = EndCounts()
     began_s = time.process_time()
     curve = []
-    for done in range(every, steps + 1, every):
+    for _ in range(steps // every):
         model.learn(every, reset_num_timesteps=False, callback=counts)
-        point = _tested(model, env, test_env, done, tests, counts, time.process_time() - began_s)
+        point = _tested(model, env, test_env, tests, counts, time.process_time() - began_s)
         told(point)
         curve.append(point)
     return curve
@@ -124,7 +124,6 @@ def _tested(
     model: SAC,
     scaled: VecNormalize,
     env: gymnasium.Env[Any, Any],
-    steps: int,
     tests: int,
     counts: EndCounts,
     cpu_s: float,
@@ -143,8 +142,8 @@ def _tested(
         successes += int(info["is_success"])
         touched += event
     return Point(
-        steps=steps,
-        robot_s=steps * env.unwrapped.period_s,  # type: ignore[attr-defined]
+        steps=model.num_timesteps,
+        robot_s=model.num_timesteps * env.unwrapped.period_s,  # type: ignore[attr-defined]
         successes=successes,
         tests=tests,
         touched=touched,

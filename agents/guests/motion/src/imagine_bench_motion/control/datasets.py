@@ -120,7 +120,7 @@ def _card(settings: DemonstrationSettings) -> dict[str, Json]:
     """The facts of a set that are known before it is played."""
     spec = registry.task(settings.task)
     env, _ = stage(settings.task, settings.appearance, settings.size)
-    facts = spec.facts()
+    facts = env.task.facts()  # a grip that slips costs nothing here
     environment = describe_environment()
     return {
         **dataclasses.asdict(settings),
@@ -348,7 +348,7 @@ def describe(kept: Demonstrations) -> str:
     lines = {
         "episodes": f"{episodes:,} of {card['transitions']:,} commands at {card['rate_hz']:g} Hz, as {card['format']}",
         "success": f"{card['successes'] / episodes:.1%} of episodes [{low:.1%}, {high:.1%}]",
-        "return": f"{card['mean_return']:.2f} an episode; optimum {card['optimal_return']:.2f}",
+        "return": f"{card['mean_return']:.2f} an episode; optimum {card['optimal_return']:.2f} if all is seen",
         "content": card["content"],
         "task": f"{card['env_id']}, control {card['control']}, appearance {card['appearance']}",
         "images": f"{' and '.join(CAMERAS)}, {card['size']} pixels",

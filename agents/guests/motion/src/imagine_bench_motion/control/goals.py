@@ -27,20 +27,23 @@ class GoalEnv(gymnasium.Wrapper[Observed, Any, Observed, Any]):
 
     Observations are a dict: ``observation``, the parts of the environment's in one vector; ``achieved_goal`` and
     ``desired_goal``, for each object x, y, z (m), and the cosine and sine of its yaw, float32 (5 N,). A goal is where
-    the objects of a macrostate stand that the optimal policy reaches by success. The reward is 0 where it is reached
-    and -1 elsewhere. ``info["is_success"]`` says so.
+    the optimal policy leaves the objects that it moves until its success, and where the others stand. The reward is 0
+    where it is reached and -1 elsewhere. ``info["is_success"]`` says so.
 
     Args:
         env: Whose observation has vectors only: parts of ``proprio``, ``objects`` and ``state``.
 
     Raises:
-        InvalidValueError: Images among the observed parts, or a world whose images hide something or are late.
+        InvalidValueError: Images among the observed parts, a world whose images hide something or are late, or a dense
+            reward.
     """
 
     def __init__(self, env: MotionEnv) -> None:
         super().__init__(env)
         if env.task.sight is not None:
             raise InvalidValueError("Goals say what the scene is like now; give a world without gesture and lag.")
+        if env.reward != "sparse":
+            raise InvalidValueError("The reward is 0 at the goal and -1 elsewhere; leave out reward.")
         parts = env.observation_space
         self._names: tuple[str, ...] = tuple(parts.spaces) if isinstance(parts, gymnasium.spaces.Dict) else ()
         spaces = [parts[name] for name in self._names] if self._names else [parts]
@@ -63,8 +66,8 @@ class GoalEnv(gymnasium.Wrapper[Observed, Any, Observed, Any]):
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Observed, Info]:
         """Start an episode, as :class:`imagine_bench.tasks.continuous.env.MotionEnv` does; its goal follows from it."""
         seen, info = self.env.reset(seed=seed, options=options)
-        self._planned.places = self._motion.world.places
-        self._planned.place(self._wanted(self._motion.episode.macrostate), np.random.default_rng(0))
+        self._planned.set_state(self._motion.world.get_state())
+        self._carry_out_plan(self._motion.episode.macrostate)
         self._goal = _goal_of(self._planned.object_poses())
         observation = self._observation(seen)
         return observation, {**info, "is_success": self._reached(observation) == 0.0}
@@ -98,17 +101,17 @@ class GoalEnv(gymnasium.Wrapper[Observed, Any, Observed, Any]):
             "desired_goal": self._goal.copy(),
         }
 
-    def _wanted(self, start: State) -> State:
-        """The macrostate in which the optimal policy succeeds, where chance is as kind as it can be."""
+    def _carry_out_plan(self, macrostate: State) -> None:
+        """Set the planned scene to the optimal policy's success, where chance is as kind as it can be."""
         rules = self._motion.task.rules
-        macrostate = start
         while macrostate in self._to_go:
-            outcomes = rules.outcomes(macrostate, rules.optimal_action(macrostate))
+            action = rules.optimal_action(macrostate)
+            outcomes = rules.outcomes(macrostate, action)
             best = min(outcomes, key=lambda each: 0 if each.success else self._to_go.get(each.macrostate, math.inf))
             macrostate = best.macrostate
+            self._planned.set_outcome(action, macrostate)
             if best.terminated:
                 break
-        return macrostate
 
 
 def _goal_of(poses: Floats) -> NDArray[np.float32]:

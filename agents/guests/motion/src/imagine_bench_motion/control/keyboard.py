@@ -122,7 +122,8 @@ class HandGame(gymnasium.Wrapper[Arrays, Command, Arrays, Command]):
     def summary(self) -> str:
         """How often the person solved the task, beside the optimum."""
         said = play.solved_words(self.solved, self.episodes)
-        return f"{said}; optimum {self._task.facts().optimum:.1%} if all is seen." if self.episodes else f"{said}."
+        optimum = self._scene.task.facts().optimum  # of grips that do not slip, for one that slips costs nothing
+        return f"{said}; optimum {optimum:.1%} if all is seen." if self.episodes else f"{said}."
 
     def render(self) -> Frame:
         """The window: the scene, both cameras, the person's wish, and the keys. Shape (H, W, 3)."""

@@ -53,8 +53,8 @@ class MotionJudgement:
 
     Raises:
         UnknownNameError: No such task or model.
-        InvalidValueError: A task without continuous control or whose frames hide something, or sizes or seeds out of
-            range.
+        InvalidValueError: A task without continuous control, whose frames hide something or whose grips slip by chance,
+            or sizes or seeds out of range.
     """
 
     task: str  #: task of macro-actions that has continuous control
@@ -72,6 +72,11 @@ class MotionJudgement:
             raise InvalidValueError(
                 f"Frames of {self.task} hide some of the world or are late, and motions are judged by frames that show "
                 "it as it is. Judge a task without the parameters gesture and lag."
+            )
+        if registry.task_entry(self.task).options.get("slip"):
+            raise InvalidValueError(
+                f"Chance decides where a motion of {self.task} ends, and one end of the simulator is taken for the "
+                "truth. Judge a task without the parameter slip."
             )
         if not self.models or not self.seeds or min(self.seeds) < 0:
             raise InvalidValueError("There is nothing to judge; give at least one model and one seed of at least 0.")
