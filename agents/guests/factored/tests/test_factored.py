@@ -13,10 +13,11 @@ import pytest
 from agent_states import same
 from fake_codes import ACTIONS, SIZES, agent, frame, live, starts, success
 from imagine_bench_factored.agent import ACCEPTED, FactoredAgent
-from imagine_bench_factored.factors import CodeTransition
+from imagine_bench_factored.factors import CodeTransition, contradictions
 from imagine_bench_factored.model import FactoredModel, Moves, Results
 from imagine_bench_factored.perception import CodePerception
 from imagine_bench_factored.planner import TIE, Planner
+from imagine_bench_factored.rewards import reward_classes
 from imagine_bench_factored.settings import DynamicsSettings, FactoredSettings
 from imagine_bench_factored.structured import StructuredModel
 from numpy.typing import NDArray
@@ -55,6 +56,18 @@ def test_what_an_untried_action_does_is_imagined_as_expected(sizes: Code) -> Non
     stayed = np.mean([not any(following) for following, _ in drawn])
     assert stayed == pytest.approx(np.prod([chance[0] for chance in expected]), abs=0.1) and stayed < 0.8
     assert all(not any(model.sample(code, 0, rng)[0]) for _ in range(20)), "seen to stay"
+
+
+def test_nothing_is_learned_from_transitions_that_are_not_clear() -> None:
+    seen = rows(starts())
+    false = [row._replace(reward=-row.reward, terminated=not row.terminated, is_first=True) for row in seen]
+    unclear = [row._replace(is_clear=False) for row in false]
+    alone, both, misled = (fitted([*seen, *more]) for more in ([], unclear, false))
+    expected = alone.probabilities(seen)
+    np.testing.assert_array_equal(both.probabilities(seen), expected)
+    assert not np.array_equal(misled.probabilities(seen), expected)
+    assert contradictions([*seen, *unclear]) == 0 < contradictions([*seen, *false])
+    assert reward_classes([*seen, *unclear]) == reward_classes(seen)
 
 
 def test_by_chance_imagined_factors_change_independently() -> None:

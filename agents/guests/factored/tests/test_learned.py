@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_codes import drawn, starts
+from fake_codes import ACTIONS, drawn, starts
 from fake_pictures import Code, agent, picture, played, shape
 from imagine_bench_factored.learned import LearnedPerceptionAgent
 from imagine_bench_factored.perception import LearnedPerception
@@ -17,6 +17,7 @@ from imagine_bench_factored.settings import LearnedPerceptionSettings
 from numpy.typing import NDArray
 
 from imagine_bench.interfaces import AgentState, Frame, Observation
+from imagine_bench.seeding import SeedTree
 
 
 def walk(steps: int, rng: np.random.Generator) -> tuple[list[Code], Frame]:
@@ -68,7 +69,7 @@ def told_apart(
 ) -> tuple[list[int], NDArray[np.int64]]:
     """How many values each factor has that is found in frames, and the codes of these frames; all are known."""
     found = appearance.find(frames, begins, actions)
-    codes, known = appearance.read(found, frames)
+    codes, known, _ = appearance.read(found, frames)
     assert known.all()
     return [len(factor.joint) for factor in found], codes
 
@@ -79,7 +80,7 @@ def test_factors_and_values_are_found_in_few_frames_of_its_own() -> None:
     found = appearance.find(frames)
     assert sorted(len(factor.joint) for factor in found) == [2, 3, 3]
     truth, fresh = walk(300, np.random.default_rng(1))
-    codes, known = appearance.read(found, fresh)
+    codes, known, _ = appearance.read(found, fresh)
     named = set(zip(map(tuple, codes.tolist()), truth, strict=True))
     assert len(named) == len({code for code, _ in named}) == len(set(truth)) > 6
     assert known.mean() > 0.98
@@ -190,12 +191,44 @@ def test_a_faint_edge_in_an_empty_place_is_no_value() -> None:
     assert sizes == [3] and pairs(codes[:, 0], value) == 3
 
 
+class _Doubtful(LearnedPerception):
+    """Is unsure of frames whose first pixel is black."""
+
+    def codes(self, frames: Frame) -> tuple[list[Code], NDArray[np.bool_], NDArray[np.bool_]]:
+        codes, known, _ = super().codes(frames)
+        return codes, known, frames[:, 0, 0].any(axis=-1)
+
+
+def test_a_transition_is_clear_if_both_of_its_frames_are() -> None:
+    """Also once factors were found anew, and in a snapshot."""
+    rng = np.random.default_rng(0)
+    settings = agent().settings
+    learner, again = (
+        LearnedPerceptionAgent(_Doubtful(settings.perception, factored=True), ACTIONS, settings, SeedTree(0))
+        for _ in "ab"
+    )
+    clear = []
+    for episode in range(12):
+        for transition in played(None, rng):
+            frames = [transition.observation.frame.copy(), transition.next_observation.frame.copy()]
+            doubtful = rng.random(2) < 0.2
+            for frame, each in zip(frames, doubtful, strict=True):
+                frame[0, 0] *= not each
+            before, after = (Observation(frame=frame) for frame in frames)
+            learner.observe(replace(transition, observation=before, next_observation=after), episode=episode)
+            clear.append(not doubtful.any())
+    assert len(learner.perception.history) > 2 and 0.4 < np.mean(clear) < 0.8
+    assert [row.is_clear for row in learner.replay] == clear
+    again.restore(learner.state())
+    assert again.replay == learner.replay
+
+
 def test_a_look_that_was_never_seen_is_unknown() -> None:
     rng = np.random.default_rng(0)
     codes, frames = walk(80, rng)
     without = np.array([code[0] != 2 for code in codes])
     found = appearance.find(frames[without])
-    _, known = appearance.read(found, frames)
+    _, known, _ = appearance.read(found, frames)
     wheel = int(np.argmin(known[~without].mean(axis=0)))
     assert known[~without][:, wheel].mean() < 0.1 and known[without].all(axis=1).mean() > 0.95
 
@@ -256,7 +289,7 @@ def test_it_learns_to_see_and_to_act_from_nothing(trained: Trained) -> None:
 def test_remembered_transitions_get_their_frames_present_codes(trained: Trained) -> None:
     learner, _ = trained
     eyes = learner.perception
-    codes, _ = eyes.codes(np.stack(eyes.frames))
+    codes, _, _ = eyes.codes(np.stack(eyes.frames))
     looked = [row for row in zip(learner.replay, eyes.transitions, strict=True) if row[1][1] < eyes.looked_at]
     assert looked
     assert all(row.code == codes[before] and row.following == codes[after] for row, (before, after) in looked)

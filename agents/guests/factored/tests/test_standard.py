@@ -69,7 +69,7 @@ def corrections(standard: Standard) -> set[str]:
 
 def pairs(found: list[appearance.SeenFactor], frames: object, codes: NDArray[np.int64]) -> list[int]:
     """How many pairs of a found and a true value there are, of the true factor that each found one is."""
-    read, _ = appearance.read(found, np.asarray(frames))
+    read, _, _ = appearance.read(found, np.asarray(frames))
     return sorted(
         min(len(set(zip(values.tolist(), truth.tolist(), strict=True))) for values in read.T) for truth in codes.T
     )
@@ -107,9 +107,27 @@ def test_nearly_all_half_hidden_values_are_read() -> None:
     standard = standard_of(seen)
     assert corrections(standard) == {"hidden"}
     whole = standard.of(seen)
-    read, _ = appearance.read(appearance.find(whole), np.asarray(whole))
+    read, _, _ = appearance.read(appearance.find(whole), np.asarray(whole))
     for truth in codes.T:
         assert max(share_right(values, truth) for values in read.T) >= 0.95
+
+
+def test_what_is_hidden_is_not_clear_and_all_that_is_clear_is_right() -> None:
+    codes, frames = drawn(2)
+    found = appearance.find(frames)
+    assert appearance.read(found, frames).clear.all(), "nothing is hidden"
+    hidden = frames.astype(np.float32)
+    top, left = np.random.default_rng(3).integers(0, 12, size=(2, COUNT))
+    for frame, row, column in zip(hidden, top, left, strict=True):
+        frame[row : row + 14, column : column + 14] = np.nan  # over the first mark, or a part of it
+    values, _, clear = appearance.read(found, hidden)
+    first = [column for column in range(len(PLACES)) if not clear[:, column].all()]
+    assert len(first) == 1 and 0.2 < clear[:, first].mean() < 0.9
+    told = {
+        code: value for code, value in zip(codes[:, 0], appearance.read(found, frames).values[:, first[0]], strict=True)
+    }
+    right = values[:, first[0]] == [told[code] for code in codes[:, 0].tolist()]
+    assert right[clear[:, first[0]]].all() and not right.all()
 
 
 def share_right(values: NDArray[np.int64], truth: NDArray[np.int64]) -> float:

@@ -101,21 +101,21 @@ class CodeAgent:
             return int(self.rng.integers(self.n_actions)) if explore else 0
         code = self.perception.code(observation.frame)
         if not explore:
-            return self._act_greedily(code)
+            return self._act_greedily(code, is_clear=self.perception.is_clear(observation.frame))
         self._chosen = None
         values = self.exploring_values(code)
         return int(self.rng.choice(np.flatnonzero(values >= values.max() - TIE)))
 
-    def _act_greedily(self, code: Code) -> int:
+    def _act_greedily(self, code: Code, *, is_clear: bool) -> int:
         """The action of the largest value.
 
         Nothing is learned in a test. But an unseen transition after which this episode went on ends no episode: without
         this, an agent that expects a reward there in vain would try the same again and again.
         """
-        if self._chosen is not None and self.model.outcomes.goes_on(*self._chosen, code):
+        if is_clear and self._chosen is not None and self.model.outcomes.goes_on(*self._chosen, code):
             self.planner.learned()
         action = int(self._values(code).argmax())
-        self._chosen = (code, action)
+        self._chosen = (code, action) if is_clear else None
         return action
 
     def exploring_values(self, code: Code) -> Floats:
@@ -151,7 +151,9 @@ class CodeAgent:
             code = self.perception.code(transition.observation.frame)
             following = self.perception.code(transition.next_observation.frame)
             row = CodeTransition(code, transition.action, following, transition.reward, transition.terminated)
-            row = row._replace(is_first=self._observed == 0)
+            frames = (transition.observation.frame, transition.next_observation.frame)
+            is_clear = all(map(self.perception.is_clear, frames))
+            row = row._replace(is_first=self._observed == 0, is_clear=is_clear)
             self._observed += 1
             class_reward = self.rewards.reward(row)
             (probability,), (unknown,) = self.model.probabilities([row._replace(reward=class_reward)])
@@ -277,7 +279,7 @@ def completed(state: AgentState) -> AgentState:
     """A snapshot with all that those of earlier versions lack.
 
     Until 2026-11-28 there were no classes of rewards, so every reward was its own class; until 2026-11-29 nothing told
-    which transitions began an episode, so starts were no evidence.
+    which transitions began an episode, so starts were no evidence; until 2026-11-30 all codes counted as clear.
     """
     if "replay/reward" not in state.arrays:
         return state
@@ -285,6 +287,7 @@ def completed(state: AgentState) -> AgentState:
     arrays = {
         "replay/class_reward": rewards.astype(np.float64),
         "replay/is_first": np.zeros(len(rewards), dtype=np.bool_),
+        "replay/is_clear": np.ones(len(rewards), dtype=np.bool_),
         **state.arrays,
     }
     return AgentState(arrays=arrays, values={"classed": len(rewards), **state.values})

@@ -36,6 +36,7 @@ class CodeTransition(NamedTuple):
     ``has_dynamics``: it happened, and so shows the order of codes; False if it was only asked about.
     ``has_reward``: reward and end are known; False if a query about it got no label.
     ``is_first``: an episode began with it.
+    ``is_clear``: both codes are certain; nothing is learned from others, as where an object was hidden.
     """
 
     code: Code
@@ -46,6 +47,7 @@ class CodeTransition(NamedTuple):
     has_dynamics: bool = True
     has_reward: bool = True
     is_first: bool = False
+    is_clear: bool = True
 
 
 def as_arrays(rows: Sequence[CodeTransition], factors: int) -> Arrays:
@@ -100,6 +102,7 @@ def remembering(rows: Sequence[CodeTransition], begins: Iterable[bool], memory: 
 
 
 def contradictions(rows: Sequence[CodeTransition]) -> int:
-    """How many transitions brought another outcome than the first of the same codes and action."""
-    first = {row[:3]: row[3:5] for row in reversed(rows)}
-    return sum(first[row[:3]] != row[3:5] for row in rows)
+    """How many clear transitions brought another outcome than the first of the same codes and action."""
+    told = [row for row in rows if row.is_clear]
+    first = {row[:3]: row[3:5] for row in reversed(told)}
+    return sum(first[row[:3]] != row[3:5] for row in told)

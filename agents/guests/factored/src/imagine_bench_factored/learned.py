@@ -119,11 +119,12 @@ class LearnedPerceptionAgent(CodeAgent):
 
     def _rows(self) -> list[CodeTransition]:
         """The replayed transitions, with the codes that its frames have now, as far as they are seen."""
-        codes, _ = self.perception.codes(np.stack(self.perception.frames))
-        return [
-            row._replace(code=codes[before], following=codes[after])
-            for row, (before, after) in zip(self.replay, self.perception.transitions, strict=False)
-        ]
+        codes, _, clear = self.perception.codes(np.stack(self.perception.frames))
+        rows = []
+        for row, (before, after) in zip(self.replay, self.perception.transitions, strict=False):
+            is_clear = bool(clear[before] and clear[after])
+            rows.append(row._replace(code=codes[before], following=codes[after], is_clear=is_clear))
+        return rows
 
     def perceived(self) -> Iterator[Perceived]:
         """Its perception whenever that changed; see :class:`.capabilities.SeeingLearner`."""

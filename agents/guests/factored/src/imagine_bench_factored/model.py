@@ -62,7 +62,9 @@ class FactoredModel:
         self.outcomes = OutcomeModel(sizes, n_actions, settings.outcomes)
 
     def add(self, row: CodeTransition) -> None:
-        """Take in one transition, as far as it shows the order of codes and their rewards."""
+        """Take in a clear transition, as far as it shows the order of codes and their rewards; no other."""
+        if not row.is_clear:
+            return
         if row.has_dynamics:
             self.dynamics.add(np.array(row.code), row.action, np.array(row.following[: self._moving]))
         if row.has_reward:
@@ -204,7 +206,8 @@ def choose(
             for row in compress(remembered, learned):
                 model.add(row)
             model.outcomes.fit()
-            chance, _ = model.probabilities(list(compress(remembered, ~learned)))
+            others = [row for row in compress(remembered, ~learned) if row.is_clear]
+            chance, _ = model.probabilities(others)
             likelihood[memory] += float(np.log(np.maximum(chance, _LEAST)).sum())
     best = max(likelihood, key=lambda memory: likelihood[memory])
     return best if likelihood[best] > likelihood[None] + settings.memory_evidence else None

@@ -56,6 +56,10 @@ class CodePerception:
         codes = torch.stack([values.argmax(dim=1) for values in hot.split(self._encoded, dim=1)], dim=1).numpy()
         return _rows(codes, self._encoded, factored=self._factored)
 
+    def is_clear(self, frame: Frame) -> bool:
+        """Whether the code of a frame is certain: an encoder does not say when it is not."""
+        return True
+
     def latents(self, codes: Sequence[Code] | Codes) -> torch.Tensor:
         """N codes as the encoder decodes them: one-hot. Shape (N, sum of the encoder's sizes)."""
         rows = np.array(codes, dtype=np.int64).reshape(-1, len(self.sizes))
@@ -87,6 +91,14 @@ def _rows(codes: Codes, sizes: Sequence[int], *, factored: bool) -> list[Code]:
     """Codes (N, P) as tuples; where they are not ``factored``, as the numbers of whole codes."""
     rows = codes if factored else np.ravel_multi_index(tuple(codes.T), sizes)[:, None]
     return [tuple(row) for row in rows.tolist()]
+
+
+class _ReadFrame(NamedTuple):
+    """The code of a frame, whether all of its values are known, and whether they are clear."""
+
+    code: Code
+    is_known: bool
+    is_clear: bool
 
 
 class FrameFactors(NamedTuple):
@@ -153,34 +165,39 @@ class LearnedPerception:
 
     def code(self, frame: Frame) -> Code:
         """The code of the newest frame (64, 64, 3) of an episode, with the memory of those before."""
-        code = self._read(frame)[0]
+        code = self._read(frame).code
         if self.memory is None:
             return code
         self._remembered = self.memory.after(self._remembered, code)
         return (*code, self._remembered)
 
-    def _read(self, frame: Frame) -> tuple[Code, bool]:
-        """The code of a frame, and whether all of its values are known; the last ones are kept."""
+    def is_clear(self, frame: Frame) -> bool:
+        """Whether each value of a frame fits clearly better than any other: not where too much is hidden."""
+        return self._read(frame).is_clear
+
+    def _read(self, frame: Frame) -> _ReadFrame:
+        """The code of a frame; the last ones are kept."""
         key = frame.tobytes()
         if key not in self._recent:
-            codes, known = self.codes(frame[None])
-            self._recent[key] = (codes[0], bool(known.all()))
+            codes, known, clear = self.codes(frame[None])
+            self._recent[key] = _ReadFrame(codes[0], bool(known.all()), bool(clear[0]))
             if len(self._recent) > _RECENT:
                 self._recent.pop(next(iter(self._recent)))
         return self._recent[key]
 
-    def codes(self, frames: Frame) -> tuple[list[Code], Mask]:
-        """The codes of frames (N, 64, 64, 3), and which values are known, (N, P)."""
+    def codes(self, frames: Frame) -> tuple[list[Code], Mask, Mask]:
+        """The codes of frames (N, 64, 64, 3), which values are known, (N, P), and which codes are clear, (N,)."""
         if not self.found:
-            return [(0,)] * len(frames), np.zeros((len(frames), 1), dtype=bool)
-        codes, known = appearance.read(self.found, self.frame_factors.standard.of(frames))
-        return _rows(codes, [len(factor.joint) for factor in self.found], factored=self._factored), known
+            return [(0,)] * len(frames), np.zeros((len(frames), 1), dtype=bool), np.ones(len(frames), dtype=bool)
+        read = appearance.read(self.found, self.frame_factors.standard.of(frames))
+        codes = _rows(read.values, [len(factor.joint) for factor in self.found], factored=self._factored)
+        return codes, read.known, read.clear.all(axis=1)
 
     def remember(self, before: Frame, action: int, after: Frame, *, begins: bool = False) -> None:
         """Remember a transition; one that begins where the last one ended costs one frame."""
         new = [after] if self.frames and np.array_equal(self.frames[-1], before) else [before, after]
         self.frames += [frame.copy() for frame in new]
-        self.unknown |= not all(self._read(frame)[1] for frame in new)
+        self.unknown |= not all(self._read(frame).is_known for frame in new)
         self.transitions.append((len(self.frames) - 2, len(self.frames) - 1))
         self.begins.append(begins)
         self.actions.append(action)
@@ -214,7 +231,7 @@ class LearnedPerception:
         self.found = frame_factors.factors
         self.found_in = found_in
         self.memory: Memory | None = None
-        self._recent: dict[bytes, tuple[Code, bool]] = {}
+        self._recent: dict[bytes, _ReadFrame] = {}
 
     def arrays(self) -> Arrays:
         """The frames that it remembers, and which are those of each transition."""

@@ -64,7 +64,7 @@ EXACT = RewardClasses()
 
 def reward_classes(rows: Sequence[CodeTransition]) -> RewardClasses:
     """The classes of the rewards of transitions; exact ones, unless they are noisy."""
-    told = [row for row in rows if row.has_reward]
+    told = [row for row in rows if row.has_reward and row.is_clear]
     sightings: dict[Key, list[float]] = {}
     for row in told:
         sightings.setdefault(_key(row), []).append(row.reward)

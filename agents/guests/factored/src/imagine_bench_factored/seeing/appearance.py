@@ -18,7 +18,7 @@ Shapes: ``N`` frames, ``P`` factors, ``D`` numbers of a crop.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -73,6 +73,14 @@ _DARK = 2.5  # of 255
 _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
 
 
+class Reading(NamedTuple):
+    """The values that N frames show, of one factor, (N,), or of P, (N, P)."""
+
+    values: Ints
+    known: Mask  #: whether such a value was seen before
+    clear: Mask  #: whether no other value fits nearly as well, as one may where a part is hidden
+
+
 class Part(NamedTuple):
     """One region, and crops of which each shows a value."""
 
@@ -84,10 +92,14 @@ class Part(NamedTuple):
     #: where it is in front of noise, the values that :func:`quiet` needs. Shape (K, 64, 64, 3).
     rests: Images | None = None
 
-    def read(self, shapes: Images) -> tuple[Ints, Mask]:
-        """The value that each of N frames' contours shows, and whether it is known. Two arrays (N,)."""
-        apart = distances(crops(shapes, self.mask), self.exemplars, self.mask, self.flat)
-        return self.values[apart.argmin(axis=1)], apart.min(axis=1) <= self.reach
+    def read(self, shapes: Images) -> Reading:
+        """The value that each of N frames' contours shows."""
+        own = crops(shapes, self.mask)
+        apart = distances(own, self.exemplars, self.mask, self.flat)
+        values = self.values[apart.argmin(axis=1)]
+        of_others = np.where(self.values == values[:, None], np.inf, apart).min(axis=1)
+        clear = (of_others >= _SAME) | ~np.isnan(own).any(axis=1)
+        return Reading(values, apart.min(axis=1) <= self.reach, clear)
 
 
 class SeenFactor(NamedTuple):
@@ -96,23 +108,26 @@ class SeenFactor(NamedTuple):
     parts: tuple[Part, ...]
     joint: Codes
 
-    def read(self, shapes: Images, still: Images) -> tuple[Ints, Mask]:
+    def read(self, shapes: Images, still: Images) -> Reading:
         """As of a part, ``still``: without noise; of joint values not seen the one that differs in the fewest parts."""
-        pairs = [part.read(shapes if part.rests is None else still) for part in self.parts]
-        found = np.stack([value for value, _ in pairs], axis=1)
-        known = np.stack([sure for _, sure in pairs], axis=1)
-        wrong = (found[:, None] != self.joint).sum(axis=2)  # [N, K]
-        return wrong.argmin(axis=1), known.all(axis=1) & (wrong.min(axis=1) == 0)
+        found = _stacked([part.read(shapes if part.rests is None else still) for part in self.parts])
+        wrong = (found.values[:, None] != self.joint).sum(axis=2)  # [N, K]
+        known = found.known.all(axis=1) & (wrong.min(axis=1) == 0)
+        return Reading(wrong.argmin(axis=1), known, found.clear.all(axis=1))
 
 
-def read(factors: list[SeenFactor], frames: Frame | Images) -> tuple[Codes, Mask]:
-    """Codes (N, P) of frames (N, 64, 64, 3), and whether each value is known, (N, P)."""
+def _stacked(readings: Sequence[Reading]) -> Reading:
+    """Readings (N,) of several as one, (N, P)."""
+    return Reading(*(np.stack(column, axis=1) for column in zip(*readings, strict=True)))
+
+
+def read(factors: list[SeenFactor], frames: Frame | Images) -> Reading:
+    """The values of P factors that frames (N, 64, 64, 3) show, (N, P)."""
     images = relative(frames)
     shapes = contours(images)
     rests = next((part.rests for factor in factors for part in factor.parts if part.rests is not None), None)
     still = shapes if rests is None else contours(quiet(images, rests))
-    pairs = [factor.read(shapes, still) for factor in factors]
-    return np.stack([value for value, _ in pairs], axis=1), np.stack([known for _, known in pairs], axis=1)
+    return _stacked([factor.read(shapes, still) for factor in factors])
 
 
 def find(frames: Frame | Images, begins: Mask | None = None, actions: Ints | None = None) -> list[SeenFactor]:
@@ -142,7 +157,7 @@ def _parts(images: Images, shapes: Images, begins: Mask, actions: Ints) -> list[
     noise = np.any([mask & (singles > _NOISE) for mask, _, singles in found] or [often & False], axis=0)
     noise = scipy.ndimage.binary_propagation(noise, np.ones((3, 3)), often)  # all that hangs together with it, too
     seen = [part for mask, part, _ in found if part is not None and not (mask & noise).any()]
-    parts = [(part, part.read(shapes)[0]) for part in seen]
+    parts = [(part, part.read(shapes).values) for part in seen]
     if noise.any():
         rests = _resting(images, change, noise)
         still = quiet(images, rests)
@@ -150,7 +165,7 @@ def _parts(images: Images, shapes: Images, begins: Mask, actions: Ints) -> list[
         shapes = contours(still)
         hiding = [_part(shapes, mask, actions) for mask in regions(change, noise & _often(change, begins))]
         seen = [part._replace(rests=rests) for part, singles in hiding if part is not None and singles <= _NOISE]
-        parts += [(part, part.read(shapes)[0]) for part in seen]
+        parts += [(part, part.read(shapes).values) for part in seen]
     return parts
 
 
@@ -372,7 +387,7 @@ def _part(shapes: Images, mask: Mask, actions: Ints) -> tuple[Part | None, float
         for values, reach in _finer(np.minimum(apart, apart.T)):
             rows = _exemplars(apart, values)
             part = Part(mask, own[chosen[rows]], values[rows], flat, reach)
-            found, known = part.read(shapes)
+            found, known, _ = part.read(shapes)
             if tried:
                 coarser = tried[-1][2]
                 after = actions[before], coarser[before + 1]
