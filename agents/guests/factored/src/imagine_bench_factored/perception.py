@@ -191,7 +191,8 @@ class LearnedPerception:
             return [(0,)] * len(frames), np.zeros((len(frames), 1), dtype=bool), np.ones(len(frames), dtype=bool)
         read = appearance.read(self.found, self.frame_factors.standard.of(frames))
         codes = _rows(read.values, [len(factor.joint) for factor in self.found], factored=self._factored)
-        return codes, read.known, read.clear.all(axis=1)
+        clear: Mask = np.logical_and.reduce(read.clear, axis=1)
+        return codes, read.known, clear
 
     def remember(self, before: Frame, action: int, after: Frame, *, begins: bool = False) -> None:
         """Remember a transition; one that begins where the last one ended costs one frame."""

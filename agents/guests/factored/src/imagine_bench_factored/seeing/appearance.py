@@ -113,7 +113,8 @@ class SeenFactor(NamedTuple):
         found = _stacked([part.read(shapes if part.rests is None else still) for part in self.parts])
         wrong = (found.values[:, None] != self.joint).sum(axis=2)  # [N, K]
         known = found.known.all(axis=1) & (wrong.min(axis=1) == 0)
-        return Reading(wrong.argmin(axis=1), known, found.clear.all(axis=1))
+        clear: Mask = np.logical_and.reduce(found.clear, axis=1)
+        return Reading(wrong.argmin(axis=1), known, clear)
 
 
 def _stacked(readings: Sequence[Reading]) -> Reading:
