@@ -42,9 +42,10 @@ class BytePerception(LearnedPerception):
         self.fine = self.frame_factors
         self.left = renews_at
 
-    def codes(self, frames: Frame) -> tuple[list[State], NDArray[np.bool_]]:
+    def codes(self, frames: Frame) -> tuple[list[State], NDArray[np.bool_], NDArray[np.bool_]]:
         values = frames[:, 0, 0, 0] // (1 if self.frame_factors is self.fine else 2)
-        return [(int(value),) for value in values], np.ones((len(frames), 1), dtype=bool)
+        every = np.ones(len(frames), dtype=bool)
+        return [(int(value),) for value in values], every[:, None], every
 
     def code(self, frame: Frame) -> State:
         return self.codes(frame[None])[0][0]
@@ -100,10 +101,10 @@ class PixelPerception(LearnedPerception):
         self._factored = True
         self.take(FrameFactors(factors, Standard()), 0)
 
-    def codes(self, frames: Frame) -> tuple[list[State], NDArray[np.bool_]]:
+    def codes(self, frames: Frame) -> tuple[list[State], NDArray[np.bool_], NDArray[np.bool_]]:
         places = [factor.joint.shape[1] for factor in self.found]
         codes = [tuple(row) for row in frames[:, 0, places, 0].tolist()]
-        return codes, np.ones((len(frames), len(places)), dtype=bool)
+        return codes, np.ones((len(frames), len(places)), dtype=bool), np.ones(len(frames), dtype=bool)
 
     def code(self, frame: Frame) -> State:
         return self.codes(frame[None])[0][0]

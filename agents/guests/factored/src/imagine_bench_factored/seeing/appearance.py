@@ -73,7 +73,7 @@ _DARK = 2.5  # of 255
 _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
 
 
-class Reading(NamedTuple):
+class SeenValues(NamedTuple):
     """The values that N frames show, of one factor, (N,), or of P, (N, P)."""
 
     values: Ints
@@ -92,14 +92,14 @@ class Part(NamedTuple):
     #: where it is in front of noise, the values that :func:`quiet` needs. Shape (K, 64, 64, 3).
     rests: Images | None = None
 
-    def read(self, shapes: Images) -> Reading:
+    def read(self, shapes: Images) -> SeenValues:
         """The value that each of N frames' contours shows."""
         own = crops(shapes, self.mask)
         apart = distances(own, self.exemplars, self.mask, self.flat)
         values = self.values[apart.argmin(axis=1)]
         of_others = np.where(self.values == values[:, None], np.inf, apart).min(axis=1)
         clear = (of_others >= _SAME) | ~np.isnan(own).any(axis=1)
-        return Reading(values, apart.min(axis=1) <= self.reach, clear)
+        return SeenValues(values, apart.min(axis=1) <= self.reach, clear)
 
 
 class SeenFactor(NamedTuple):
@@ -108,21 +108,21 @@ class SeenFactor(NamedTuple):
     parts: tuple[Part, ...]
     joint: Codes
 
-    def read(self, shapes: Images, still: Images) -> Reading:
+    def read(self, shapes: Images, still: Images) -> SeenValues:
         """As of a part, ``still``: without noise; of joint values not seen the one that differs in the fewest parts."""
         found = _stacked([part.read(shapes if part.rests is None else still) for part in self.parts])
         wrong = (found.values[:, None] != self.joint).sum(axis=2)  # [N, K]
         known = found.known.all(axis=1) & (wrong.min(axis=1) == 0)
         clear: Mask = np.logical_and.reduce(found.clear, axis=1)
-        return Reading(wrong.argmin(axis=1), known, clear)
+        return SeenValues(wrong.argmin(axis=1), known, clear)
 
 
-def _stacked(readings: Sequence[Reading]) -> Reading:
+def _stacked(readings: Sequence[SeenValues]) -> SeenValues:
     """Readings (N,) of several as one, (N, P)."""
-    return Reading(*(np.stack(column, axis=1) for column in zip(*readings, strict=True)))
+    return SeenValues(*(np.stack(column, axis=1) for column in zip(*readings, strict=True)))
 
 
-def read(factors: list[SeenFactor], frames: Frame | Images) -> Reading:
+def read(factors: list[SeenFactor], frames: Frame | Images) -> SeenValues:
     """The values of P factors that frames (N, 64, 64, 3) show, (N, P)."""
     images = relative(frames)
     shapes = contours(images)
