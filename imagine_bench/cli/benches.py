@@ -303,7 +303,7 @@ class Sweep:
             self._study(grid.only(added_up(self.variants)))
         else:
             suite = grid.only(added_up(self.experiment))
-            self._suite(replace(suite, seeds=tuple(sorted(self.seeds))) if self.seeds else suite)
+            self._suite(replace(suite, seeds=self.seeds) if self.seeds else suite)
 
     def _study(self, study: Study) -> None:
         if self.task is None:

@@ -30,6 +30,7 @@ from imagine_bench.protocols.data import digest
 from imagine_bench.report.page import write_page
 from imagine_bench.report.sweep import study_page
 from imagine_bench.rules import states_of
+from imagine_bench.running.bench import load_bench
 from imagine_bench.statistics import Estimate
 from imagine_bench.store.results import PolicyTable
 from imagine_bench.sweep.grid import BASE, GRIDS, Study, Variant, read_grid
@@ -75,6 +76,16 @@ def test_every_variant_is_run_once_and_compared(
     rows = list(csv.DictReader(page.files["seeds.csv"].splitlines()))
     assert [row["success"] for row in rows][:4] == ["0.1", "0.2", "0.3", "0.4"]
     assert [row["imagined_right"] for row in rows][4:] == ["0.1000", "0.2000", "0.3000", "0.4000"]
+
+
+def test_rows_of_a_study_name_the_seeds_of_their_runs(tmp_path: Path) -> None:
+    blind = Variant(name="blind", agent="random")
+    study = dataclasses.replace(STUDY, seeds=(1001, 1000), budgets=(1,), evaluation_episodes=60, variants=(blind,))
+    lines = run_study(study, "arrow_puzzle", root=tmp_path, launcher=Inline())
+    rows = csv.DictReader(study_page(study, lines).files["seeds.csv"].splitlines())
+    told = {int(row["seed"]): float(row["success"]) for row in rows}
+    kept = {run.seed: run.checkpoints[0].success_rate for run in load_bench(lines[0].folder).runs}
+    assert told == pytest.approx(kept, abs=1e-5) and kept[1000] != kept[1001]
 
 
 def test_a_difference_is_that_from_what_a_variant_is_compared_with(tmp_path: Path) -> None:
