@@ -235,6 +235,12 @@ def _merged(results: Sequence[BenchResult], protocols: Sequence[Protocol]) -> Pr
     code = sorted({pair for protocol in protocols for pair in protocol.code})
     if len(dict(code)) < len(code):
         raise InvalidValueError("An agent's code was another one in each of the benches; they cannot be merged.")
+    budgets = set.intersection(*(set(protocol.budgets) for protocol in protocols))
+    if not budgets:
+        each = "; ".join(
+            f"{result.folder} {protocol.budgets}" for result, protocol in zip(results, protocols, strict=True)
+        )
+        raise InvalidValueError(f"No budget is in all of the benches that are merged: {each}.")
     return dataclasses.replace(
         first,
         agent_names=max(protocol.agent_names for protocol in protocols),
@@ -242,7 +248,7 @@ def _merged(results: Sequence[BenchResult], protocols: Sequence[Protocol]) -> Pr
         code=tuple(code),
         settings_digest=first.settings_digest if same_agents else digest(digests),
         seeds=tuple(sorted({seed for protocol in protocols for seed in protocol.seeds})),
-        budgets=tuple(sorted(set.intersection(*(set(protocol.budgets) for protocol in protocols)))),
+        budgets=tuple(sorted(budgets)),
         evaluation_episodes=min(protocol.evaluation_episodes for protocol in protocols),
         headlines=tuple(dict.fromkeys(pair for protocol in protocols for pair in protocol.headlines)),
         few_seeds=_few_seeds(protocols),
