@@ -138,10 +138,11 @@ def _largest_table(whole: Protocol, reached: Mapping[tuple[str, int], int]) -> P
     """Return the complete protocol that has most results, among all cuts through the budgets."""
     tables = []
     for count, budget in enumerate(whole.budgets, start=1):
-        short = {seed for (_, seed), at in reached.items() if at < budget}
+        short = {seed for agent, seed in whole.runs if reached[agent, seed] < budget}
         seeds = tuple(seed for seed in whole.seeds if seed not in short)
-        if all(set(seeds) & set(whole.seeds_of(agent)) for agent in whole.agents):
-            tables.append((count * len(seeds), count, seeds))
+        runs = [len({*seeds} & {*whole.seeds_of(agent)}) for agent in whole.agents]
+        if all(runs):
+            tables.append((count * sum(runs), count, seeds))
     if not tables:
         raise ArtefactError(
             f"No seed of this bench has brought every agent to {whole.budgets[0]} real episodes yet, so there is "

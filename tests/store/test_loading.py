@@ -210,6 +210,20 @@ def test_an_unfinished_bench_keeps_its_largest_table(tmp_path: Path) -> None:
     assert part.missing == ("random seed 1: 4 of 9 real episodes",)
 
 
+def test_the_largest_table_counts_the_results_of_all_agents(tmp_path: Path) -> None:
+    """Two budgets of the three agents of seed 0 are six results; one budget of all seeds is five."""
+    protocol = small(agents=("oracle", "table", "random"), seeds=(0, 1, 2), budgets=(4, 9), evaluation_episodes=3)
+    few = (("oracle", 0), ("random", 0))
+    made = bench(dataclasses.replace(protocol, few_seeds=few), {}, root=tmp_path, launcher=Inline())
+    kept = kept_from(made.folder, tmp_path / "kept")
+    rows = (kept / "results.csv").read_text().splitlines(keepends=True)
+    late = [row for row in rows if row.startswith(("table,1,9,", "table,2,9,"))]
+    assert len(late) == 2
+    (kept / "results.csv").write_text("".join(row for row in rows if row not in late))
+    part = load_so_far(kept).protocol
+    assert (part.budgets, part.seeds, len(part.runs)) == ((4, 9), (0,), 3)
+
+
 def test_a_damaged_table_is_named(tmp_path: Path) -> None:
     first, second = do(tmp_path, "oracle"), do(tmp_path, "random")
     kept = kept_from(second, tmp_path / "kept")
