@@ -21,6 +21,7 @@ from report_pages import page_in_words
 from small_runs import Inline
 from whole_outputs import Expected
 
+import imagine_bench
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import InvalidValueError, UnknownNameError
@@ -86,6 +87,15 @@ def test_rows_of_a_study_name_the_seeds_of_their_runs(tmp_path: Path) -> None:
     told = {int(row["seed"]): float(row["success"]) for row in rows}
     kept = {run.seed: run.checkpoints[0].success_rate for run in load_bench(lines[0].folder).runs}
     assert told == pytest.approx(kept, abs=1e-5) and kept[1000] != kept[1001]
+
+
+def test_a_study_that_was_written_is_loaded(tmp_path: Path) -> None:
+    study = dataclasses.replace(STUDY, budgets=(1, 2), variants=(Variant(name="blind", agent="random"),))
+    page = study_page(study, run_study(study, "arrow_puzzle", root=tmp_path, launcher=Inline()))
+    write_page(tmp_path / "out", page)
+    frame = imagine_bench.load(tmp_path / "out").frame()
+    assert list(zip(frame["seed"], frame["episodes"], strict=True)) == [(s, b) for s in (1000, 1001) for b in (1, 2)]
+    assert all(isinstance(each, str) for each in frame["protocol"])
 
 
 def test_a_difference_is_that_from_what_a_variant_is_compared_with(tmp_path: Path) -> None:
