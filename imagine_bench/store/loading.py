@@ -35,6 +35,8 @@ _COLUMNS = (
     *("mean_return", "mean_length", "faults", "train_cpu_s", "eval_cpu_s", "solved"),
 )
 """Columns of every table of results; those of diagnostics follow."""
+_APART = "diagnostics/"
+"""Before the name of a diagnostic that is also that of another column."""
 _OWN = ("agents", "seeds", "budgets", "agent_names", "code", "evaluation_episodes", "few_seeds", "headlines")
 """Fields in which merged benches may differ; their encoders must agree where both have one."""
 
@@ -66,7 +68,7 @@ def _kept_runs(folder: Path, whole: Protocol) -> Runs:
     rows: dict[tuple[str, int], list[Checkpoint]] = {}
     with reading(folder / _RESULTS, "the table of a bench of agents"):
         for row in table_rows((folder / _RESULTS).read_text(), ("agent", "solved")):
-            diagnostics = {name: float(value) for name, value in row.items() if name not in _COLUMNS}
+            diagnostics = {_name_of(name): float(value) for name, value in row.items() if name not in _COLUMNS}
             agent = agent_label(row["agent"], {"agent_names": whole.agent_names})
             checkpoint = unpack(Checkpoint, {**row, "diagnostics": diagnostics}, {})
             rows.setdefault((agent, row["seed"]), []).append(checkpoint)
@@ -101,8 +103,20 @@ def results_csv(result: BenchResult) -> str:
         derived = {"success_rate": checkpoint.success_rate, "wilson_low": low, "wilson_high": high}
         known = {**vars(checkpoint), **derived, "agent": protocol.written_name(run.agent), "seed": run.seed}
         known["solved"] = checkpoint.solved or ""
-        rows.append({name: known[name] for name in _COLUMNS} | {n: checkpoint.diagnostics.get(n, "") for n in names})
+        diagnostics = {_column_of(name): checkpoint.diagnostics.get(name, "") for name in names}
+        rows.append({name: known[name] for name in _COLUMNS} | diagnostics)
     return table_text(rows)
+
+
+def _column_of(diagnostic: str) -> str:
+    """The column of a diagnostic, whatever name an agent gave it."""
+    return f"{_APART}{diagnostic}" if diagnostic in _COLUMNS else diagnostic
+
+
+def _name_of(column: str) -> str:
+    """The inverse of :func:`_column_of`."""
+    name = column.removeprefix(_APART)
+    return name if name in _COLUMNS else column
 
 
 def _largest_part(whole: Protocol, runs: Runs, folder: Path) -> BenchResult:

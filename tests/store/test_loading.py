@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_results import bench_result
+from fake_results import bench_result, rewritten
 from small_runs import Inline, small
 
 from imagine_bench.cli import exit_code as main
@@ -20,7 +20,7 @@ from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.report import summary_table, write_report
 from imagine_bench.running.bench import bench, load_bench
-from imagine_bench.store.loading import cut, load_so_far, merge
+from imagine_bench.store.loading import archive_files, cut, load_so_far, merge
 from imagine_bench.store.results import BenchResult, KeptEpisodes
 
 
@@ -193,6 +193,19 @@ def test_kept_results_say_what_their_run_folders_said(tmp_path: Path, capsys: py
     (page,) = tmp_path.glob("*/merged-*/report/index.html")
     assert "oracle" in shown and "random" in shown and str(page) in shown
     assert not (first / "report").exists()
+
+
+def test_no_diagnostic_takes_the_place_of_a_column(tmp_path: Path) -> None:
+    """Whatever an agent of somebody else calls its measures."""
+    said = {"successes": 99.0, "episodes": 1.0, "seed": 7.5, "agent": 0.5, "loss": 2.0}
+    made = load_bench(do(tmp_path, "oracle", "random", seeds=(0, 1)))
+    result = rewritten(made, lambda run, row: dataclasses.replace(row, diagnostics=said if run.seed else {}))
+    for name, text in archive_files(result).items():
+        (tmp_path / name).write_text(text)
+    again = load_so_far(tmp_path)
+    assert [(run.agent, run.seed) for run in again.runs] == [(run.agent, run.seed) for run in result.runs]
+    for (_, row), (_, known) in zip(again.rows, result.rows, strict=True):
+        assert row == known
 
 
 def test_an_unfinished_bench_keeps_its_largest_table(tmp_path: Path) -> None:
