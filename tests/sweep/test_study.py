@@ -89,6 +89,13 @@ def test_rows_of_a_study_name_the_seeds_of_their_runs(tmp_path: Path) -> None:
     assert told == pytest.approx(kept, abs=1e-5) and kept[1000] != kept[1001]
 
 
+def test_settings_in_the_name_of_an_agent_may_be_spelled_in_any_way(tmp_path: Path) -> None:
+    spelled = Variant(name="slow", agent="count_table:controller.discount=0.90")
+    study = dataclasses.replace(STUDY, seeds=(1000,), budgets=(1,), evaluation_episodes=1, variants=(spelled,))
+    (line,) = run_study(study, "arrow_puzzle", root=tmp_path, launcher=Inline())
+    assert line.success.shape == line.imagined_right.shape == (1, 1)
+
+
 def test_a_study_that_was_written_is_loaded(tmp_path: Path) -> None:
     study = dataclasses.replace(STUDY, budgets=(1, 2), variants=(Variant(name="blind", agent="random"),))
     page = study_page(study, run_study(study, "arrow_puzzle", root=tmp_path, launcher=Inline()))
