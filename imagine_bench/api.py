@@ -191,7 +191,8 @@ def bench(
         agents: Names, and classes or functions, which are registered by their name; or one alone. By default the
             preset's agents.
         preset: The size of the comparison.
-        seeds: Seeds, or their number; by default the preset's. Each agent is trained once a seed.
+        seeds: Seeds, or their number; by default the preset's. Each agent is trained once a seed; where no
+            agents are named, some of the preset ``quick`` have fewer seeds.
         workers: Processes at a time; by default one a core.
         launcher: ``"local"``, ``"this_process"`` (for a debugger), ``"ray"`` or ``"slurm"``.
         track: ``"tensorboard"`` or ``"wandb"`` (offline): metrics are also written for it, as the runs go, into a
