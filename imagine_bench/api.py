@@ -48,14 +48,14 @@ if TYPE_CHECKING:
 
 MakeAgent = Callable[[AgentContext], Agent]
 """A class or a function that makes an agent from its context."""
-_MAIN_TABLES = ("results", "scores")
+_MAIN_TABLES = ("results", "scores", "seeds")
 _NOTEBOOK = "ipykernel"
 """The module that carries out the cells of a notebook."""
 _SETTINGS = ("set", "physics")
 """Options that are mappings."""
 _OWN = ("preset", "workers", "launcher", "track", "out")
 """Keywords of :func:`bench` that are no part of a protocol."""
-_TEXT = ("solved",)
+_TEXT = ("solved", "protocol")
 """Columns whose digits are a text."""
 
 
@@ -88,7 +88,7 @@ class Comparison:
 
     @cached_property
     def tables(self) -> Mapping[str, str]:
-        """The CSV files of the report by name, the main one first: ``results`` or ``scores``."""
+        """The CSV files of the report by name, the main one first: ``results``, ``scores`` or of a study ``seeds``."""
         if self.make_page is None:
             found = {path.stem: path.read_text() for path in sorted(self.folder.glob("*.csv"))}
         else:
@@ -191,7 +191,8 @@ def bench(
         agents: Names, and classes or functions, which are registered by their name; or one alone. By default the
             preset's agents.
         preset: The size of the comparison.
-        seeds: Seeds, or their number; by default the preset's. Each agent is trained once a seed.
+        seeds: Seeds, or their number; by default the preset's. Each agent is trained once a seed; where no
+            agents are named, some of the preset ``quick`` have fewer seeds.
         workers: Processes at a time; by default one a core.
         launcher: ``"local"``, ``"this_process"`` (for a debugger), ``"ray"`` or ``"slurm"``.
         track: ``"tensorboard"`` or ``"wandb"`` (offline): metrics are also written for it, as the runs go, into a

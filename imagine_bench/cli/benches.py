@@ -110,7 +110,8 @@ class Budget:
     """Options of how much is run."""
 
     seeds: Counts = None
-    """Seeds, by default the preset's, such as 0 1 2 or 0-21; each agent has one run a seed."""
+    """Seeds, by default the preset's, such as 0 1 2 or 0-21. Each agent has one run a seed; without --agents, some of
+    the preset quick have fewer."""
     budgets: Counts = None
     """Real training episodes at which agents are tested, ascending; by default the preset's."""
     variants: ManyWords = ()
@@ -303,7 +304,7 @@ class Sweep:
             self._study(grid.only(added_up(self.variants)))
         else:
             suite = grid.only(added_up(self.experiment))
-            self._suite(replace(suite, seeds=tuple(sorted(self.seeds))) if self.seeds else suite)
+            self._suite(replace(suite, seeds=self.seeds) if self.seeds else suite)
 
     def _study(self, study: Study) -> None:
         if self.task is None:

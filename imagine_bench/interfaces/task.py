@@ -54,6 +54,7 @@ class PhysicsSettings:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
                 raise InvalidValueError(f"Physics setting {name} is {value!r}; give a number from {low:g} to {high:g}.")
+            object.__setattr__(self, name, float(value))  # 1 and 1.0 are one setting, with one hash
         require_known("sense", self.sense, SENSES)
 
     @classmethod

@@ -256,10 +256,10 @@ def _is_whole(folder: Path, cell: ModelFit) -> bool:
 
 
 def _read(folder: Path, cell: ModelFit) -> dict[str, Any] | None:
-    """A cell as it is kept; None where it is not, or its model's code has changed."""
+    """A cell as it is kept; None where it is not, or its model's code, or its run, is another one now."""
     file = folder / cell.file
     found = read_sealed(file, "a judged cell") if file.exists() else {"code": None}
-    now = code_of(cell.model)
+    now = code_of(cell.model, cell.seed)
     return found if found.get("code", now) == now else None
 
 
@@ -341,7 +341,7 @@ def _judged(
         "reader": world.reader_digest,
         "policies": world.policies_digest,
         "privileged": model_entry(cell.model).privileged,
-        "code": code_of(cell.model),
+        "code": code_of(cell.model, cell.seed),
     }
     images = _images(cell.model, judged.model, world, scores["worst"], seeds.child("pictures").generator())
     return found, images if film is None else images | film.images(world.index.frame)

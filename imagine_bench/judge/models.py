@@ -38,7 +38,7 @@ from imagine_bench.running.trained import KeptAgent, agent_of, imaginer_of, kept
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
 from imagine_bench.store.files import read_sealed
-from imagine_bench.store.run_folder import load_run
+from imagine_bench.store.run_folder import load_run, mark_digest
 
 __path__: list[str] = []  # the old path imagine_bench.judge.models.outcomes is looked for below this module
 _CONFIG = "config.json"
@@ -309,9 +309,10 @@ def model_entry(model: str) -> WorldModelEntry:
     return WorldModelEntry(make=str(entry.make), title=title, privileged=entry.privileged, encoder_kind=kind)
 
 
-def code_of(model: str) -> str:
-    """A digest of the package that offers a world model; empty for one of this suite, and for the agents of runs."""
-    return "" if runs_of(model) else registry.package_code(model_entry(model).make)
+def code_of(model: str, seed: int) -> str:
+    """A digest of the package that offers a world model, empty for one of this suite; or of the run of a seed."""
+    runs = runs_of(model)
+    return mark_digest(runs[seed]) if seed in runs else registry.package_code(model_entry(model).make)
 
 
 def one_name(model: str) -> str:

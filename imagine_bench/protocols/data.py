@@ -131,11 +131,15 @@ def package_digests(places: Mapping[str, str]) -> tuple[tuple[str, str], ...]:
 
 
 def require_types(one: DataclassInstance) -> None:
-    """Make lists in the fields of a dataclass tuples, or raise InvalidValueError for a value of another type."""
+    """Make lists in the fields of a dataclass tuples and whole numbers floats where these are wanted, or raise
+    InvalidValueError for a value of another type.
+    """
     for name, hint in get_type_hints(type(one)).items():
         if isinstance(value := getattr(one, name), list):
             value = tuple(tuple(item) if isinstance(item, list) else item for item in value)
             object.__setattr__(one, name, value)
+        if hint is float and type(value) is int and abs(value) <= MOST:
+            object.__setattr__(one, name, float(value))
         try:
             if has_switch(value) and not re.search("bool|Any", str(hint)):
                 raise TypeCheckError("true or false is no number")

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from imagine_bench import reference
 from imagine_bench.arrays import Floats
-from imagine_bench.protocols.control import PRESETS
+from imagine_bench.protocols.control import PRESETS, Protocol
 from imagine_bench.registry.entries import FIRST
 from imagine_bench.report import figures, sections
 from imagine_bench.report.data import (
@@ -69,7 +69,8 @@ def bench_page(result: BenchResult) -> Page:
     files = {**archive_files(result), "summary.csv": summary_csv(data)}
     if any(row.open_loop for _, row in result.rows):
         files["open_loop.csv"] = open_loop_csv(result)
-    dataset = f" · trained first on dataset {protocol.dataset}" if protocol.dataset else ""
+    helped = "".join(f" · {words}" for words in _beyond_own_episodes(protocol))
+    execution = ", ".join([f"{protocol.execution} execution", *(f"{name}={value}" for name, value in protocol.physics)])
     split = f" · tests start where training never does, {protocol.split}" if protocol.split else ""
     fewer = [f"{agent} {len(protocol.seeds_of(agent))}" for agent, _ in protocol.few_seeds]
     few = f" ({', '.join(fewer)})" if fewer else ""
@@ -78,9 +79,9 @@ def bench_page(result: BenchResult) -> Page:
     if len(protocol.seeds) == 1:
         interval = "95 % interval over test episodes only (Wilson; one seed says nothing about the luck of training)"
     subtitle = (
-        f"Preset {protocol.preset} · {protocol.execution} execution · appearance “{protocol.appearance_in_words}” · "
+        f"Preset {protocol.preset} · {execution} · appearance “{protocol.appearance_in_words}” · "
         f"{len(protocol.seeds)} seed{'s' * (len(protocol.seeds) != 1)}{few}, "
-        f"{trials} test episode{'s' * (trials != 1)}{dataset}{split} · "
+        f"{trials} test episode{'s' * (trials != 1)}{helped}{split} · "
         f"{interval} · protocol {result.protocol_hash}"
     )
     return Page(
@@ -93,6 +94,21 @@ def bench_page(result: BenchResult) -> Page:
         files=files,
         facts=made(result),
     )
+
+
+def _beyond_own_episodes(protocol: Protocol) -> Iterator[str]:
+    """The help that learners get beyond their own episodes on the task, in words."""
+    if protocol.dataset:
+        yield f"trained first on dataset {protocol.dataset}"
+    if protocol.after:
+        notice = ", without notice of a change" * protocol.unannounced
+        yield f"trained before on {', '.join(protocol.after)}, {protocol.after_episodes:,} episodes each{notice}"
+    if protocol.demonstrations:
+        yield f"first training episodes demonstrated: {protocol.demonstrations:,}"
+    if protocol.queries:
+        yield f"up to {protocol.queries:,} oracle queries an episode"
+    if protocol.feedback:
+        yield f"a teacher's feedback of {protocol.feedback:g}, wrong in {percent(protocol.feedback_error)} %"
 
 
 # The verdict -------------------------------------------------------------------------------------------------------

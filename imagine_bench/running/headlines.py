@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from imagine_bench import registry, statistics
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.protocols.control import Protocol
+from imagine_bench.protocols.data import require_seeds
 from imagine_bench.statistics import LEVEL, Estimate
 from imagine_bench.store.loading import merge
 from imagine_bench.store.results import BenchResult
@@ -90,7 +91,8 @@ def until_decided(plan: Callable[..., BenchResult], first: Protocol, *, most: in
         The bench of the first stage, those of all further seeds, and last, if there are any, all as one bench.
 
     Raises:
-        InvalidValueError: The protocol has no headline, or ``most`` is less than its seeds.
+        InvalidValueError: The protocol has no headline, ``most`` is less than its seeds, or tuning seeds would be added
+            to reported ones.
     """
     if not first.headlines:
         raise InvalidValueError(
@@ -98,22 +100,29 @@ def until_decided(plan: Callable[..., BenchResult], first: Protocol, *, most: in
             "has two if --agents is left out."
         )
     counts = stages(len(first.seeds), most)
+    seeds = (*first.seeds, *range(first.seeds[-1] + 1, first.seeds[-1] + 1 + most - len(first.seeds)))
+    require_seeds(seeds)
     few = {agent: len(first.seeds_of(agent)) for agent, _ in first.few_seeds}
     whole = plan(seeds=first.seeds, most_looks=len(counts), few_seeds=few)
     parts = [whole]
     for before, count in itertools.pairwise(counts):
         if decided(whole):
             break
-        parts += _stage(plan, first, before, count, most_looks=len(counts))
+        parts += _stage(plan, first, seeds, before, count, most_looks=len(counts))
         whole = merge(parts, root)
     return parts if whole is parts[0] else [*parts, whole]
 
 
 def _stage(
-    plan: Callable[..., BenchResult], first: Protocol, before: int, count: int, *, most_looks: int
+    plan: Callable[..., BenchResult],
+    first: Protocol,
+    seeds: Sequence[int],
+    before: int,
+    count: int,
+    *,
+    most_looks: int,
 ) -> list[BenchResult]:
     """The benches that take the agent of most seeds from ``before`` to ``count`` of them, and others as far."""
-    seeds = (*first.seeds, *range(first.seeds[-1] + 1, first.seeds[-1] + 1 + count - len(first.seeds)))
     groups: dict[int, list[str]] = {}
     for agent in dict.fromkeys(agent for pair in first.headlines for agent in reversed(pair)):
         fewer = len(first.seeds) - len(first.seeds_of(agent))

@@ -46,7 +46,7 @@ def protocol_of_player(
     *,
     training: int | None = None,
     tests: int | None = None,
-    seed: int = 0,
+    seed: int | None = None,
     like: Path | None = None,
     execution: str | None = None,
     appearance: str | None = None,
@@ -59,7 +59,8 @@ def protocol_of_player(
         name: The player's name.
         training: Training episodes before the tests; None is 0.
         tests: Test episodes; None is :data:`TESTS`.
-        seed: Number of the player's run; runs of other numbers meet the same tests.
+        seed: Number of the player's run; None is the first seed of ``like``, or else 0. Runs of other numbers meet the
+            same tests.
         like: Folder of a bench whose world and preset are taken, so that both can be merged into one table.
         execution: How macro-actions happen; None is the task's or the bench's way.
         appearance: How frames vary; None likewise.
@@ -87,6 +88,7 @@ def protocol_of_player(
         raise InvalidValueError(
             f"{like} shows more than frames, or trains otherwise than it tests; a player cannot be compared there."
         )
+    first = 0 if like is None else found.seeds[0]
     player = f"{'' if training is None else 'trained_'}{kind}:{name}"
     return dataclasses.replace(
         found,
@@ -94,7 +96,7 @@ def protocol_of_player(
         appearance=appearance or found.appearance,
         test_appearance=None if appearance else found.test_appearance,
         agents=(player,),
-        seeds=(seed,),
+        seeds=(first if seed is None else seed,),
         few_seeds=(),
         budgets=found.budgets if training is None else (training,),
         evaluation_episodes=TESTS if tests is None else tests,

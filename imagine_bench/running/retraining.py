@@ -14,6 +14,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from imagine_bench import registry
+from imagine_bench.data.folder import read_dataset
 from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError, plain, require
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import Job, Launcher, RunSpec
@@ -111,7 +112,7 @@ def train_again(folder: Path, retraining: Retraining) -> list[Verdict]:
 
     Raises:
         ArtefactError: The bench is damaged.
-        InvalidValueError: Less than one run of each agent is asked for, or a dataset is given where no run had one.
+        InvalidValueError: Less than one run of each agent is asked for, or a dataset is given that no run had.
         SetupError: Nothing can be written, or there is no GL.
     """
     protocol = read_control(folder)
@@ -120,22 +121,33 @@ def train_again(folder: Path, retraining: Retraining) -> list[Verdict]:
     wanted = drawn(protocol, retraining.runs, retraining.nonce)
     if protocol.dataset is None and retraining.dataset is not None:
         raise InvalidValueError(f"No run of {folder} learned from a dataset; leave --dataset out.")
+    if retraining.dataset is not None:
+        given = read_dataset(retraining.dataset).identity
+        if given != protocol.dataset:
+            raise InvalidValueError(
+                f"{retraining.dataset} is {given}; runs of {folder} learned from {protocol.dataset}."
+            )
     found = []
     with TemporaryDirectory(prefix="imagine-bench-verify-") as scratch:
         again = BenchStore(Path(scratch), protocol)
         jobs = list[Job]()
+        lacking = {}
         why = {}
         for run in wanted:
             try:
                 spec = _spec(protocol, *run, retraining)
                 jobs.append(Job(spec=spec, folder=again.run_folder(*run)))
-            except ImagineBenchError as error:
-                why[run] = str(error)
+            except ImagineBenchError as error:  # its package, encoder or dataset is not here
+                lacking[run] = brief_lines(error).rstrip(".")
         with ProgressBar([job.spec for job in jobs]) as show:
             for failure in retraining.launcher.launch(jobs, show):
                 why[failure.job.spec.agent, failure.job.spec.seed] = failure.reason
         for run in wanted:
             what = f"{run[0]} seed {run[1]}, trained again"
+            if run in lacking:
+                unshown = f"whether {run[0]} seed {run[1]} repeats ({lacking[run]})"
+                found.append(Verdict(what=what, holds="not compared", unshown=(unshown,)))
+                continue
             if run in why:
                 found.append(Verdict(what=what, complaint=f"it cannot be: {brief_lines(why[run])}"))
                 continue
@@ -147,6 +159,8 @@ def train_again(folder: Path, retraining: Retraining) -> list[Verdict]:
 
 def _spec(protocol: Protocol, agent: str, seed: int, retraining: Retraining) -> RunSpec[Protocol]:
     dataset = retraining.dataset
+    if registry.is_player(agent):
+        raise ArtefactError("it is a person's, or a program's elsewhere, that cannot be trained here.")
     if protocol.dataset is not None and dataset is None and registry.agent_entry(agent).learns:
         raise ArtefactError(f"it learned from the dataset {protocol.dataset}; give its folder with --dataset.")
     through = encoder_of_run(protocol, agent, retraining.encoder)

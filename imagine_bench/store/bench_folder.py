@@ -170,11 +170,11 @@ def as_begun(root: Path, protocol: P) -> P:
 
 def with_other_code(folder: Path, protocol: ProtocolData) -> list[Path]:
     """Return the benches beside ``folder`` that differ from this protocol in the code of agents and tasks alone."""
-    wanted = {**protocol.as_dict(), "code": None}
+    wanted = digest({**protocol.as_dict(), "code": None})
     found = []
     for path in sorted(folder.parent.glob(f"{protocol.preset}-*/{_PROTOCOL}")):
         values = read_json(path, "a bench's protocol")
-        if path.parent != folder and {**values, "code": None} == wanted:
+        if path.parent != folder and digest({**values, "code": None}) == wanted:
             found.append(path.parent)
     return found
 

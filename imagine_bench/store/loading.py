@@ -35,6 +35,8 @@ _COLUMNS = (
     *("mean_return", "mean_length", "faults", "train_cpu_s", "eval_cpu_s", "solved"),
 )
 """Columns of every table of results; those of diagnostics follow."""
+_APART = "diagnostics/"
+"""Before the name of a diagnostic that is also that of another column."""
 _OWN = ("agents", "seeds", "budgets", "agent_names", "code", "evaluation_episodes", "few_seeds", "headlines")
 """Fields in which merged benches may differ; their encoders must agree where both have one."""
 
@@ -66,7 +68,7 @@ def _kept_runs(folder: Path, whole: Protocol) -> Runs:
     rows: dict[tuple[str, int], list[Checkpoint]] = {}
     with reading(folder / _RESULTS, "the table of a bench of agents"):
         for row in table_rows((folder / _RESULTS).read_text(), ("agent", "solved")):
-            diagnostics = {name: float(value) for name, value in row.items() if name not in _COLUMNS}
+            diagnostics = {_name_of(name): float(value) for name, value in row.items() if name not in _COLUMNS}
             agent = agent_label(row["agent"], {"agent_names": whole.agent_names})
             checkpoint = unpack(Checkpoint, {**row, "diagnostics": diagnostics}, {})
             rows.setdefault((agent, row["seed"]), []).append(checkpoint)
@@ -101,8 +103,20 @@ def results_csv(result: BenchResult) -> str:
         derived = {"success_rate": checkpoint.success_rate, "wilson_low": low, "wilson_high": high}
         known = {**vars(checkpoint), **derived, "agent": protocol.written_name(run.agent), "seed": run.seed}
         known["solved"] = checkpoint.solved or ""
-        rows.append({name: known[name] for name in _COLUMNS} | {n: checkpoint.diagnostics.get(n, "") for n in names})
+        diagnostics = {_column_of(name): checkpoint.diagnostics.get(name, "") for name in names}
+        rows.append({name: known[name] for name in _COLUMNS} | diagnostics)
     return table_text(rows)
+
+
+def _column_of(diagnostic: str) -> str:
+    """The column of a diagnostic, whatever name an agent gave it."""
+    return f"{_APART}{diagnostic}" if diagnostic in _COLUMNS else diagnostic
+
+
+def _name_of(column: str) -> str:
+    """The inverse of :func:`_column_of`."""
+    name = column.removeprefix(_APART)
+    return name if name in _COLUMNS else column
 
 
 def _largest_part(whole: Protocol, runs: Runs, folder: Path) -> BenchResult:
@@ -138,10 +152,11 @@ def _largest_table(whole: Protocol, reached: Mapping[tuple[str, int], int]) -> P
     """Return the complete protocol that has most results, among all cuts through the budgets."""
     tables = []
     for count, budget in enumerate(whole.budgets, start=1):
-        short = {seed for (_, seed), at in reached.items() if at < budget}
+        short = {seed for agent, seed in whole.runs if reached[agent, seed] < budget}
         seeds = tuple(seed for seed in whole.seeds if seed not in short)
-        if all(set(seeds) & set(whole.seeds_of(agent)) for agent in whole.agents):
-            tables.append((count * len(seeds), count, seeds))
+        runs = [len({*seeds} & {*whole.seeds_of(agent)}) for agent in whole.agents]
+        if all(runs):
+            tables.append((count * sum(runs), count, seeds))
     if not tables:
         raise ArtefactError(
             f"No seed of this bench has brought every agent to {whole.budgets[0]} real episodes yet, so there is "
@@ -235,6 +250,12 @@ def _merged(results: Sequence[BenchResult], protocols: Sequence[Protocol]) -> Pr
     code = sorted({pair for protocol in protocols for pair in protocol.code})
     if len(dict(code)) < len(code):
         raise InvalidValueError("An agent's code was another one in each of the benches; they cannot be merged.")
+    budgets = set.intersection(*(set(protocol.budgets) for protocol in protocols))
+    if not budgets:
+        each = "; ".join(
+            f"{result.folder} {protocol.budgets}" for result, protocol in zip(results, protocols, strict=True)
+        )
+        raise InvalidValueError(f"No budget is in all of the benches that are merged: {each}.")
     return dataclasses.replace(
         first,
         agent_names=max(protocol.agent_names for protocol in protocols),
@@ -242,7 +263,7 @@ def _merged(results: Sequence[BenchResult], protocols: Sequence[Protocol]) -> Pr
         code=tuple(code),
         settings_digest=first.settings_digest if same_agents else digest(digests),
         seeds=tuple(sorted({seed for protocol in protocols for seed in protocol.seeds})),
-        budgets=tuple(sorted(set.intersection(*(set(protocol.budgets) for protocol in protocols)))),
+        budgets=tuple(sorted(budgets)),
         evaluation_episodes=min(protocol.evaluation_episodes for protocol in protocols),
         headlines=tuple(dict.fromkeys(pair for protocol in protocols for pair in protocol.headlines)),
         few_seeds=_few_seeds(protocols),

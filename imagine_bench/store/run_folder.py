@@ -210,6 +210,13 @@ def is_done(folder: Path) -> bool:
     return (folder / _DONE).is_file()
 
 
+def mark_digest(folder: Path) -> str:
+    """Twelve hex digits of the mark of a finished run, which has the digests of its files; empty of an unfinished
+    one.
+    """
+    return sha256(folder / _DONE)[:12] if is_done(folder) else ""
+
+
 @contextmanager
 def unfinished(folder: Path) -> Iterator[bool]:
     """Hold a run's folder for this process, without the leftovers of a killed one; yields whether anything is left to

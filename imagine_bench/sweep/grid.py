@@ -29,19 +29,21 @@ BASE = "base"
 MEASURES = ("success", "auroc")
 """``"success"`` of test episodes, between a level's exact chance and optimum; or ``"auroc"``, with which epistemic
 uncertainty tells wrong imagined transitions from right ones, between 0.5 and 1."""
-_STUDY_SETS = {
+_OF_GRID = {
     "task",
     "preset",
     "agents",
     "seeds",
-    "budgets",
+    "few_seeds",
     "evaluation_episodes",
-    "overrides",
     "settings_digest",
     "codes",
     "code",
+    "agent_names",
 }
-_VARIED = sorted({each.name for each in dataclasses.fields(Protocol)} - _STUDY_SETS)
+"""Fields of a protocol that a grid sets alike for all its members."""
+_OF_LEVEL = sorted({each.name for each in dataclasses.fields(Protocol)} - _OF_GRID)
+_VARIED = sorted({*_OF_LEVEL} - {"budgets", "overrides"})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,6 +86,7 @@ class Study:
                 raise InvalidValueError(
                     f"Variant {variant.name!r} is compared with {variant.against!r}, which the study lacks: {names}."
                 )
+        object.__setattr__(self, "seeds", tuple(sorted(self.seeds)))  # as results have them
         if not self.seeds or not all(map(is_tuning_seed, self.seeds)):
             raise InvalidValueError(
                 f"Study {self.name!r} chooses settings on seeds {self.seeds}; give seeds from {TUNING_SEEDS} on, which "
@@ -106,10 +109,16 @@ class Level:
     name: str  #: The value, for axes and tables
     task: str  #: Canonical name of the world
     episodes: int = 250  #: Real training episodes, on this task
-    protocol: Mapping[str, Any] = field(default_factory=dict)  #: More fields of the protocol that differ
+    #: More fields of the protocol that differ; ``budgets`` may have others before ``episodes``.
+    protocol: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         require_types(self)
+        for name in self.protocol:
+            require_known("field that a level may change", name, _OF_LEVEL)
+        budgets = self.protocol.get("budgets", [self.episodes])
+        if not isinstance(budgets, list | tuple) or [*budgets][-1:] != [self.episodes]:
+            raise InvalidValueError(f"Level {self.name!r} has {self.episodes} episodes; give budgets that end there.")
         if "@" in self.task:  # a file of options may change
             object.__setattr__(self, "task", registry.task_name(self.task))
 
@@ -127,6 +136,12 @@ class Experiment:
     def __post_init__(self) -> None:
         require_types(self)
         require_known("measure", self.measure, MEASURES)
+        silent = [level.name for level in self.levels if not level.protocol.get("open_loop_starts")]
+        if self.measure == "auroc" and silent:
+            raise InvalidValueError(
+                f"Experiment {self.name!r} measures auroc, and its levels {silent} have no rollouts to measure; give "
+                "open_loop_starts in the protocol of each, such as 100."
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,6 +159,7 @@ class Suite:
 
     def __post_init__(self) -> None:
         require_types(self)
+        object.__setattr__(self, "seeds", tuple(sorted(self.seeds)))  # as results have them
         _require_names(self.name, "experiments", self.experiments)
         for each in self.experiments:
             _require_names(self.name, f"levels of {each.name}", each.levels)

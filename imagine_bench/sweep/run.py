@@ -68,7 +68,8 @@ def run_study(study: Study, task: str, *, root: Path, launcher: Launcher) -> tup
 
 def _line(study: Study, variant: Variant, results: Mapping[str, BenchResult], rules: Rules) -> Line:
     result = results[variant.name]
-    success = result.success_rates(variant.agent)
+    (agent,) = result.protocol.agents  # as the protocol spells it
+    success = result.success_rates(agent)
     differences = None
     if variant.against is not None:
         base = results[variant.against]
@@ -77,7 +78,7 @@ def _line(study: Study, variant: Variant, results: Mapping[str, BenchResult], ru
     return Line(
         variant=variant,
         success=success,
-        imagined_right=imagined_right(rules, result.of(variant.agent)),
+        imagined_right=imagined_right(rules, result.of(agent)),
         train_cpu_s=float(np.mean([run.checkpoints[-1].train_cpu_s for run in result.runs])),
         difference=differences,
         folder=result.folder,

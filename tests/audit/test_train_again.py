@@ -21,9 +21,10 @@ from forging import OpenRun, mixed, rewrite_protocol
 from small_runs import QUICK, Inline, small, written
 
 from imagine_bench.cli import exit_code as main
-from imagine_bench.errors import InvalidValueError
-from imagine_bench.running.bench import bench
+from imagine_bench.errors import IncompleteCheckError, InvalidValueError
+from imagine_bench.running.bench import bench, plan
 from imagine_bench.running.control import plan_control
+from imagine_bench.running.player import played_run, protocol_of_player
 from imagine_bench.running.retraining import Retraining, Verdict, chance_to_find, drawn, train_again
 from imagine_bench.store.files import read_sealed, sealed
 from imagine_bench.tools.audits import conclusion, verify, what_is_shown
@@ -106,6 +107,29 @@ def test_a_dataset_from_which_no_run_learned_is_refused(pair: Path, tmp_path: Pa
     superfluous = dataclasses.replace(again(), dataset=written(tmp_path / "set").folder)
     with pytest.raises(InvalidValueError, match=r"No run of .* learned from a dataset; leave --dataset out"):
         verify(pair, superfluous)
+
+
+def test_runs_of_a_dataset_that_is_not_given_are_not_compared(tmp_path: Path) -> None:
+    few: dict[str, Any] = {"agents": ("table",), "appearance": "mild", "evaluation_episodes": 2, **QUICK}
+    given = written(tmp_path / "set").folder
+    folder = bench(*plan("arrow_puzzle", "smoke", dataset=given, **few), root=tmp_path, launcher=Inline()).folder
+    *_, last = found = verify(folder, again())
+    assert not last.complaint and "it learned from the dataset" in last.unshown[0]
+    assert isinstance(conclusion(found), IncompleteCheckError)
+    assert "repeats to the bit" in str(verify(folder, dataclasses.replace(again(), dataset=given))[-1])
+    other = dataclasses.replace(again(), dataset=written(tmp_path / "other", seed=9).folder)
+    with pytest.raises(InvalidValueError, match="learned from mixed-6@"):
+        verify(folder, other)
+
+
+def test_a_persons_run_is_not_trained_again(tmp_path: Path) -> None:
+    played = protocol_of_player("arrow_puzzle", "person", "anna", tests=1, execution="kinematic")
+    with played_run(played, tmp_path) as run:
+        while not run.is_done:
+            run.reset()
+            run.step(0)
+    *_, last = verify(run.folder.parents[1], again())
+    assert not last.complaint and "cannot be trained here" in last.unshown[0]
 
 
 def test_runs_that_do_not_hold_are_not_said_to_be_trained_again(

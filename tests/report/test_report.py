@@ -8,6 +8,7 @@ import io
 import math
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fake_results import WIDE, bench_result, rewritten
@@ -178,6 +179,24 @@ def test_a_difference_is_shown_only_after_holms_correction(many: BenchResult) ->
     for difference in (0.2, -0.2):
         assert shown({**one, "difference_to_dqn": difference, "p_holm": 1.0 - statistics.LEVEL}) == 0
         assert shown({**one, "difference_to_dqn": difference, "p_holm": 0.049}) == (1 if difference > 0 else -1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"demonstrations": 4}, "first training episodes demonstrated: 4"),
+        ({"queries": 2}, "up to 2 oracle queries an episode"),
+        ({"feedback": 5.0, "feedback_error": 0.2}, "a teacher's feedback of 5, wrong in 20.0 %"),
+        ({"after": ("arrow_puzzle_hard",)}, "trained before on arrow_puzzle_hard, 100 episodes each"),
+        ({"physics": (("pad_friction", 0.5),)}, "physics execution, pad_friction=0.5"),
+    ],
+)
+def test_the_page_says_what_helps_learners_and_what_changes_the_world(
+    result: BenchResult, changes: dict[str, Any], words: str
+) -> None:
+    protocol = dataclasses.replace(result.protocol, **changes)
+    assert f" · {words} · " in bench_page(dataclasses.replace(result, protocol=protocol)).subtitle
+    assert words not in bench_page(result).subtitle
 
 
 def test_agents_that_do_not_learn_are_not_compared(tmp_path: Path) -> None:

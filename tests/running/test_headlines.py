@@ -145,6 +145,9 @@ def test_without_headlines_or_with_too_few_seeds_nothing_is_run(tmp_path: Path) 
     for most in (6, 0, -1):
         with pytest.raises(InvalidValueError, match=f"--most-seeds {most} is fewer than .* give at least 7"):
             until_decided(never, FIRST, most=most, root=tmp_path)
+    last_reported = dataclasses.replace(FIRST, seeds=tuple(range(993, 1000)), few_seeds=())
+    with pytest.raises(InvalidValueError, match="mix tuning seeds"):
+        until_decided(never, last_reported, most=8, root=tmp_path)
 
 
 @pytest.mark.parametrize(

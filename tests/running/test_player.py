@@ -183,7 +183,7 @@ def test_nothing_of_the_learners_of_a_bench_is_said_of_a_player(tmp_path: Path) 
 def test_a_person_stands_in_the_table_of_a_bench(tmp_path: Path) -> None:
     """Its tests are the bench's first ones, and the bench's row with as many tests is that of its first ones."""
     planned = protocol(
-        "arrow_puzzle", "smoke", agents=("random", "oracle"), seeds=(0, 1), evaluation_episodes=9,
+        "arrow_puzzle", "smoke", agents=("random", "oracle"), seeds=(3, 5), evaluation_episodes=9,
         execution="kinematic", overrides=(("controller.discount", 0.9),),
     )  # fmt: skip
     there = bench(planned, {}, root=tmp_path, launcher=Inline())
@@ -192,7 +192,7 @@ def test_a_person_stands_in_the_table_of_a_bench(tmp_path: Path) -> None:
     table = merge([there, mine], tmp_path)
     assert table.protocol.evaluation_episodes == 4
     both = ("random", "oracle")
-    runs = [(agent, 0) for agent in (*both, "person:anna")] + [(agent, 1) for agent in both]
+    runs = [(agent, 3) for agent in (*both, "person:anna")] + [(agent, 5) for agent in both]
     assert [(run.agent, run.seed) for run in table.runs] == runs
     whole = {(run.agent, run.seed): run.checkpoints[0] for run in there.runs}
     anna = table.runs[2].checkpoints[0]

@@ -62,6 +62,13 @@ def test_any_change_changes_the_hash():
     assert len(hashes) == 1 + len(names) > 30
 
 
+@pytest.mark.parametrize("changes", [{"feedback": 1}, {"physics": {"pad_friction": 1}}])
+def test_a_whole_number_is_spelled_as_any_other(changes):
+    (name, value), *_ = changes.items()
+    other = {name: 1.0 if value == 1 else {"pad_friction": 1.0}}
+    assert protocol("arrow_puzzle", **changes).hash == protocol("arrow_puzzle", **other).hash
+
+
 @pytest.mark.parametrize(
     ("agents", "moved"), [(("dqn",), True), (("random", "imagination"), True), (("random", "oracle"), False)]
 )

@@ -23,6 +23,17 @@ def bench(root: Path, launcher: Inline, **changes: object) -> BenchResult:
     return benches.bench(wanted, {}, root=root, launcher=launcher)
 
 
+def test_agents_without_a_result_are_left_out_once_all_others_are_finished(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        bench(tmp_path, Inline(patience=1), seeds=(0,))
+    (folder,) = tmp_path.glob("arrow_puzzle/*")
+    (done,) = (mark.parents[1].name for mark in folder.glob("*/seed_0/DONE"))
+    (other,) = {"table", "imaginer"} - {done}
+    part = load_so_far(folder)
+    assert (part.protocol.agents, part.protocol.budgets) == ((done,), (2, 4, 9))
+    assert part.missing == (f"{other} seed 0: 0 of 9 real episodes",)
+
+
 def test_a_bench_lacks_its_unfinished_runs_alone(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         bench(tmp_path, Inline(patience=1))

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_results import bench_result
+from fake_results import bench_result, rewritten
 from small_runs import Inline, small
 
 from imagine_bench.cli import exit_code as main
@@ -20,7 +20,7 @@ from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.report import summary_table, write_report
 from imagine_bench.running.bench import bench, load_bench
-from imagine_bench.store.loading import cut, load_so_far, merge
+from imagine_bench.store.loading import archive_files, cut, load_so_far, merge
 from imagine_bench.store.results import BenchResult, KeptEpisodes
 
 
@@ -76,7 +76,7 @@ def test_every_run_of_both_is_there_unchanged(tmp_path: Path) -> None:
         (("random",), {"appearance": "mild"}, InvalidValueError, "has appearance 'mild' where .* has 'clean'"),
         (("random",), {"encoder": "x@0123456789ab"}, InvalidValueError, "has encoder 'x@.*' where .* has 'a@"),
         (("random",), {"seeds": (5,)}, ArtefactError, "No seed of this bench"),
-        (("random",), {"budgets": (3,)}, InvalidValueError, "budgets"),
+        (("random",), {"budgets": (3,)}, InvalidValueError, "No budget is in all of the benches"),
         (("oracle",), {"seeds": (5,), "settings_digest": "one"}, InvalidValueError, "has settings_digest 'one'"),
     ],
 )
@@ -195,6 +195,19 @@ def test_kept_results_say_what_their_run_folders_said(tmp_path: Path, capsys: py
     assert not (first / "report").exists()
 
 
+def test_no_diagnostic_takes_the_place_of_a_column(tmp_path: Path) -> None:
+    """Whatever an agent of somebody else calls its measures."""
+    said = {"successes": 99.0, "episodes": 1.0, "seed": 7.5, "agent": 0.5, "loss": 2.0}
+    made = load_bench(do(tmp_path, "oracle", "random", seeds=(0, 1)))
+    result = rewritten(made, lambda run, row: dataclasses.replace(row, diagnostics=said if run.seed else {}))
+    for name, text in archive_files(result).items():
+        (tmp_path / name).write_text(text)
+    again = load_so_far(tmp_path)
+    assert [(run.agent, run.seed) for run in again.runs] == [(run.agent, run.seed) for run in result.runs]
+    for (_, row), (_, known) in zip(again.rows, result.rows, strict=True):
+        assert row == known
+
+
 def test_an_unfinished_bench_keeps_its_largest_table(tmp_path: Path) -> None:
     folder = do(tmp_path, "oracle", "random", seeds=(0, 1), budgets=(4, 9))
     kept, whole = kept_from(folder, tmp_path / "kept"), load_bench(folder)
@@ -208,6 +221,20 @@ def test_an_unfinished_bench_keeps_its_largest_table(tmp_path: Path) -> None:
     assert (part.protocol.seeds, part.protocol.budgets) == ((0,), (4, 9))
     assert part.whole == whole.protocol
     assert part.missing == ("random seed 1: 4 of 9 real episodes",)
+
+
+def test_the_largest_table_counts_the_results_of_all_agents(tmp_path: Path) -> None:
+    """Two budgets of the three agents of seed 0 are six results; one budget of all seeds is five."""
+    protocol = small(agents=("oracle", "table", "random"), seeds=(0, 1, 2), budgets=(4, 9), evaluation_episodes=3)
+    few = (("oracle", 0), ("random", 0))
+    made = bench(dataclasses.replace(protocol, few_seeds=few), {}, root=tmp_path, launcher=Inline())
+    kept = kept_from(made.folder, tmp_path / "kept")
+    rows = (kept / "results.csv").read_text().splitlines(keepends=True)
+    late = [row for row in rows if row.startswith(("table,1,9,", "table,2,9,"))]
+    assert len(late) == 2
+    (kept / "results.csv").write_text("".join(row for row in rows if row not in late))
+    part = load_so_far(kept).protocol
+    assert (part.budgets, part.seeds, len(part.runs)) == ((4, 9), (0,), 3)
 
 
 def test_a_damaged_table_is_named(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from report_pages import page_in_words
 from small_runs import Inline
 from whole_outputs import Expected
 
+import imagine_bench
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import InvalidValueError, UnknownNameError
@@ -30,6 +31,7 @@ from imagine_bench.protocols.data import digest
 from imagine_bench.report.page import write_page
 from imagine_bench.report.sweep import study_page
 from imagine_bench.rules import states_of
+from imagine_bench.running.bench import load_bench
 from imagine_bench.statistics import Estimate
 from imagine_bench.store.results import PolicyTable
 from imagine_bench.sweep.grid import BASE, GRIDS, Study, Variant, read_grid
@@ -75,6 +77,32 @@ def test_every_variant_is_run_once_and_compared(
     rows = list(csv.DictReader(page.files["seeds.csv"].splitlines()))
     assert [row["success"] for row in rows][:4] == ["0.1", "0.2", "0.3", "0.4"]
     assert [row["imagined_right"] for row in rows][4:] == ["0.1000", "0.2000", "0.3000", "0.4000"]
+
+
+def test_rows_of_a_study_name_the_seeds_of_their_runs(tmp_path: Path) -> None:
+    blind = Variant(name="blind", agent="random")
+    study = dataclasses.replace(STUDY, seeds=(1001, 1000), budgets=(1,), evaluation_episodes=60, variants=(blind,))
+    lines = run_study(study, "arrow_puzzle", root=tmp_path, launcher=Inline())
+    rows = csv.DictReader(study_page(study, lines).files["seeds.csv"].splitlines())
+    told = {int(row["seed"]): float(row["success"]) for row in rows}
+    kept = {run.seed: run.checkpoints[0].success_rate for run in load_bench(lines[0].folder).runs}
+    assert told == pytest.approx(kept, abs=1e-5) and kept[1000] != kept[1001]
+
+
+def test_settings_in_the_name_of_an_agent_may_be_spelled_in_any_way(tmp_path: Path) -> None:
+    spelled = Variant(name="slow", agent="count_table:controller.discount=0.90")
+    study = dataclasses.replace(STUDY, seeds=(1000,), budgets=(1,), evaluation_episodes=1, variants=(spelled,))
+    (line,) = run_study(study, "arrow_puzzle", root=tmp_path, launcher=Inline())
+    assert line.success.shape == line.imagined_right.shape == (1, 1)
+
+
+def test_a_study_that_was_written_is_loaded(tmp_path: Path) -> None:
+    study = dataclasses.replace(STUDY, budgets=(1, 2), variants=(Variant(name="blind", agent="random"),))
+    page = study_page(study, run_study(study, "arrow_puzzle", root=tmp_path, launcher=Inline()))
+    write_page(tmp_path / "out", page)
+    frame = imagine_bench.load(tmp_path / "out").frame()
+    assert list(zip(frame["seed"], frame["episodes"], strict=True)) == [(s, b) for s in (1000, 1001) for b in (1, 2)]
+    assert all(isinstance(each, str) for each in frame["protocol"])
 
 
 def test_a_difference_is_that_from_what_a_variant_is_compared_with(tmp_path: Path) -> None:

@@ -15,10 +15,11 @@ from small_runs import Inline
 from whole_outputs import masked
 
 from imagine_bench import registry
-from imagine_bench.errors import InvalidValueError
+from imagine_bench.errors import ImagineBenchError, InvalidValueError
 from imagine_bench.exact.splits import split_of
 from imagine_bench.report.page import texts
 from imagine_bench.report.sweep import levels_csv, scores_csv, suite_page
+from imagine_bench.store.bench_folder import read_control
 from imagine_bench.sweep import grid
 from imagine_bench.sweep.grid import GRIDS, SUITE, Experiment, Level, Suite
 from imagine_bench.sweep.run import LevelResult, SuiteResult, plan_level, run_suite
@@ -89,6 +90,14 @@ def test_the_number_of_tests_widens_intervals_of_success_alone(measure, is_of_te
     few, many = interval(10, *alike), interval(10_000, *alike)
     assert (few != many) == is_of_tests
     assert few[0] <= many[0] < many[1] <= few[1]
+
+
+def test_rows_name_the_seeds_of_their_benches(tmp_path):
+    suite = dataclasses.replace(TINY, seeds=(1, 0), experiments=TINY.experiments[1:2])
+    found = run_suite(suite, ("random",), root=tmp_path, launcher=Inline())
+    rows = list(csv.DictReader(io.StringIO(levels_csv(found))))
+    runs = {row["seed"]: read_control(tmp_path / row["bench"]).seeds for row in rows}
+    assert runs == {"0": (0,), "1": (1,)}
 
 
 def test_experiments_share_a_level(result):
@@ -220,3 +229,22 @@ def test_settings_of_physics_are_a_table_in_a_level():
         level = Level(name="smooth", task="arrows", protocol={**fields, "physics": wrong})
         with pytest.raises(InvalidValueError, match=r"^physics is .*; give a table of settings, such as pad_friction"):
             plan_level(TINY, level, "table")
+
+
+@pytest.mark.parametrize(
+    ("fields", "sentence"),
+    [
+        ({"evaluation_episodes": 5}, "No field that a level may change 'evaluation_episodes'"),
+        ({"seeds": (3, 4)}, "No field that a level may change 'seeds'"),
+        ({"budgets": (10, 20)}, "Level '3' has 250 episodes; give budgets that end there"),
+    ],
+)
+def test_a_level_that_its_scores_would_misstate_is_refused(fields, sentence):
+    with pytest.raises(ImagineBenchError, match=sentence):
+        Level(name="3", task="arrows", protocol=fields)
+
+
+def test_auroc_without_imagined_rollouts_is_refused():
+    silent = Level(name="5", task="arrows", episodes=5)
+    with pytest.raises(InvalidValueError, match=r"its levels \['5'\] have no rollouts to measure"):
+        Experiment(name="uncertainty", parameter="episodes", question="?", measure="auroc", levels=(silent,))

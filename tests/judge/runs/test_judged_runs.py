@@ -78,6 +78,17 @@ def test_the_folder_of_an_agent_stands_for_all_its_runs(runs: dict[str, Path], t
     assert list(shown(folder, one)) == [agent]
 
 
+@pytest.mark.usefixtures("_few")
+def test_a_run_that_was_made_anew_is_judged_anew(tmp_path: Path) -> None:
+    wanted = small(budgets=(2,), agents=("imaginer",))
+    (run,) = benches.bench(wanted, {}, root=tmp_path, launcher=Inline()).runs
+    folder, one = _judged(tmp_path / "judge", str(run.folder), seeds=(1000,))
+    assert len(kept(folder, one)) == 1
+    shutil.rmtree(run.folder)
+    benches.bench(wanted, {}, root=tmp_path, launcher=Inline())
+    assert kept(folder, one) == []
+
+
 def _source(name: str, task: str, appearance: str = "clean", encoder: str | None = None) -> ModelSource:
     spec = registry.task(task)
     return source_of(name, spec, RenderedFrameIndex(spec, appearance), appearance, SeedTree(1000), encoder)
