@@ -75,7 +75,7 @@ def test_the_oracle_scores_one_and_who_says_nothing_of_its_model_zero(result):
 @pytest.mark.parametrize(("measure", "is_of_tests"), [("success", True), ("auroc", False)])
 def test_the_number_of_tests_widens_intervals_of_success_alone(measure, is_of_tests):
     """An AUROC is no share of the tests: its interval is that over seeds, and one seed has none."""
-    level = Level(name="a", task="arrows")
+    level = Level(name="a", task="arrows", protocol={"open_loop_starts": 1})
     experiment = Experiment(name="a", parameter="p", question="?", levels=(level,), measure=measure)
     scale = Scale(chance=0.5, optimum=1.0)
 
