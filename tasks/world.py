@@ -137,8 +137,8 @@ class World(abc.ABC):
         """Let the fingers hold a gripped object, or let it slip: without friction, they open whatever they are told."""
         settings = self.sensing.settings
         built = PhysicsSettings()
-        friction = SLIP_FRICTION if slipping else settings.pad_friction / built.pad_friction * self._tip_friction
-        self.model.geom_friction[self._tips, :1] = friction
+        friction = settings.pad_friction / built.pad_friction * self._tip_friction
+        self.model.geom_friction[self._tips, :1] = np.minimum(friction, SLIP_FRICTION) if slipping else friction
         force_n = settings.finger_force_n
         self._set_finger_force(*((SLIP_FORCE_N, SLIP_FORCE_N) if slipping else (-force_n, force_n)))
 

@@ -217,6 +217,17 @@ def test_a_grip_is_as_firm_as_its_physics_also_after_a_slip(physics: dict[str, f
     assert np.diff(events).tolist() == [int(holds and not slips) for slips in slipped]
 
 
+@pytest.mark.parametrize("pad_friction", [0.01, 0.5, 2.0])
+def test_a_grip_that_slips_never_has_more_friction_than_one_that_holds(pad_friction: float) -> None:
+    world = make_pick_place(observation="proprio", physics={"pad_friction": pad_friction}).world
+    tips = [index for index in range(world.model.ngeom) if "_tip_" in world.model.geom(index).name]
+    firm = world.model.geom_friction[tips, 0].copy()
+    world.set_slipping(True)
+    assert (world.model.geom_friction[tips, 0] == np.minimum(firm, 0.02)).all()
+    world.set_slipping(False)
+    assert (world.model.geom_friction[tips, 0] == firm).all()
+
+
 @pytest.mark.parametrize(
     ("family", "options"),
     [("arrows", {"cubes": 1}), ("arrows", {}), ("arrows", {"cubes": 6}), ("pick_place", {})],

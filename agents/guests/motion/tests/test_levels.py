@@ -19,6 +19,7 @@ from imagine_bench_motion.cloned_env import BUNDLED
 from imagine_bench_motion.flat import EndCounts, Point
 from imagine_bench_motion.levels import CurvePoint, environment, expects_nothing, learn, make_agent, oracle_success
 
+from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes
 
 KEPT = Path(__file__).parents[4] / "docs" / "results" / "motion"
@@ -211,6 +212,12 @@ def test_each_test_of_sac_counts_by_itself(monkeypatch: pytest.MonkeyPatch) -> N
     assert [(point.touched, point.successes, point.tests) for point in curve] == [(2, 1, 5)] * 2
     assert [point.mean_return for point in curve] == pytest.approx([-3.0 + 5.0 / 5] * 2)
     assert [(point.train_faults, point.train_successes) for point in curve] == [(1, 0), (2, 0)]
+
+
+@pytest.mark.parametrize("seed", [-1, 10**9])
+def test_sac_is_never_trained_on_the_seed_of_a_test(seed: int) -> None:
+    with pytest.raises(InvalidValueError, match=f"seed is {seed}; give 0 to 999,999,999"):
+        flat.learn(10, seed=seed, every=5, told=lambda point: None)
 
 
 def test_kept_numbers_of_the_page_are_those_of_the_kept_files() -> None:

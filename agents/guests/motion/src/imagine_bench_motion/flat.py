@@ -36,7 +36,8 @@ SETTINGS = {
     ),
 }
 """The library's own settings; and others, with observations and rewards that are divided by their spread so far."""
-_SEEDS = 2**31
+_TEST_SEED = 10**9
+"""Of the first test; seeds of training are below."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +74,7 @@ def learn(
 
     Args:
         steps: Control periods of training. The library makes a few at once, so before a test there may be some more.
-        seed: Of the library and the environments, below 2**31.
+        seed: Of the library and the environments, below 10**9, where the seeds of tests begin.
         settings: A name of :data:`SETTINGS`.
         every: Steps between tests.
         tests: Episodes of a test, from seeds that training never sees.
@@ -81,15 +82,17 @@ def learn(
         **options: Of the environment.
 
     Raises:
-        InvalidValueError: No test would follow, or one before the last step.
+        InvalidValueError: No test would follow, or one before the last step; or a seed that is one of the tests'.
     """
     if every < 1 or steps < every or steps % every:
         raise InvalidValueError(f"steps is {steps} and every {every}; give a multiple of every, which is at least 1.")
+    if not 0 <= seed < _TEST_SEED:
+        raise InvalidValueError(f"seed is {seed}; give 0 to {_TEST_SEED - 1:,}.")
     prepare_torch("cpu")
     scales = settings == "tuned"
     env = VecNormalize(DummyVecEnv([partial(flat_env, **options)]), norm_obs=scales, norm_reward=scales, gamma=0.97)
     test_env = flat_env(**options)
-    model = SETTINGS[settings]("MlpPolicy", env, seed=seed % _SEEDS, device="cpu")
+    model = SETTINGS[settings]("MlpPolicy", env, seed=seed, device="cpu")
     counts = EndCounts()
     began_s = time.process_time()
     curve = []
@@ -131,7 +134,7 @@ def _tested(
     successes = touched = 0
     total = 0.0
     for episode in range(tests):
-        seen, info = env.reset(seed=10**9 + episode)
+        seen, info = env.reset(seed=_TEST_SEED + episode)
         event = ended = False
         while not ended:
             action, _ = model.predict(scaled.normalize_obs(seen), deterministic=True)
