@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -59,6 +60,19 @@ def test_frequent_transitions_differ_though_rewards_overlap() -> None:
     assert found.centers[True] == pytest.approx([-5.0, 5.0], abs=0.15)
     ruled = {row[:3]: row.reward for row in exact}
     assert sum(abs(found.reward(row) - ruled[row[:3]]) > 0.3 for row in noisy) < 0.02 * 600
+
+
+@pytest.mark.parametrize(("apart", "noisy"), [(0.5, True), (55.0, False)])
+def test_rewards_that_differ_in_a_third_of_all_sightings_are_noisy_if_by_little(apart: float, *, noisy: bool) -> None:
+    """If by much, something that is not seen decides about the outcome, and each reward is one of its own."""
+    given = rows(200, codes=3)
+    times: Counter[tuple[object, ...]] = Counter()
+    for place, row in enumerate(given):
+        given[place] = row._replace(reward=row.reward - apart * (times[row[:3]] // 3 % 2))
+        times[row[:3]] += 1
+    assert (reward_classes(given) is not EXACT) == noisy
+    if noisy:
+        assert reward_classes(given).centers[True] == pytest.approx([-5.0, 50.0], abs=0.3)
 
 
 def test_a_few_rewards_make_no_class_of_their_own() -> None:

@@ -24,6 +24,10 @@ _DIFFERENT = 0.5
 """Share of different ones among these above which rewards are noisy."""
 _PAIRS = 3
 """Pairs of sightings of one transition that tell how different its rewards are."""
+_MANY = 0.25
+"""Share of these pairs that differ where a few amounts are drawn."""
+_LITTLE = 0.1
+"""Share of the range of all rewards that these differ by; by more, something that is not seen decides."""
 _NORMAL = 0.954
 """Median of the absolute difference of two normal variables, in standard deviations."""
 _LEAST = 1e-6
@@ -91,9 +95,19 @@ def _key(row: CodeTransition) -> Key:
 
 
 def _noise(sightings: Sequence[Sequence[float]]) -> float:
-    """Standard deviation of the rewards of one transition, as most have it; 0 where too few were seen again."""
-    apart = [abs(one - other) for rewards in sightings for one, other in pairwise(rewards)]
-    return float(np.median(apart)) / _NORMAL if len(apart) >= _PAIRS else 0.0
+    """Standard deviation of the rewards of one transition, as most have it; 0 where too few were seen again.
+
+    If not most of them differ, but many do by little, they have the noise that differs: a few amounts may come twice.
+    """
+    apart = np.array([abs(one - other) for rewards in sightings for one, other in pairwise(rewards)])
+    if len(apart) < _PAIRS:
+        return 0.0
+    differ = apart[apart > 0.0]
+    most = float(np.median(apart))
+    seen = [reward for rewards in sightings for reward in rewards]
+    if most == 0.0 and len(differ) >= _MANY * len(apart) and np.median(differ) <= _LITTLE * np.ptp(seen):
+        most = float(np.median(differ))
+    return most / _NORMAL
 
 
 def _is_continuous(rows: Sequence[CodeTransition]) -> bool:
