@@ -229,7 +229,7 @@ def optimal_values(tables: RuleTables) -> Floats:
             if change < _VALUE_TOLERANCE:
                 return action_values
             values, before = best, values
-        if change > change_before / 2.0:  # where chance keeps an episode going for long, it settles slowly
+        if not change <= change_before / 2.0:  # or is no number; slow where chance keeps an episode going
             endless = list(tables.index)[int(np.abs(values - before).argmax())]
             raise InvalidValueError(
                 f"From macrostate {endless} the rules allow an endless return: in {_SWEEPS} sweeps of value iteration "

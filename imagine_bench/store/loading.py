@@ -36,7 +36,7 @@ _COLUMNS = (
 )
 """Columns of every table of results; those of diagnostics follow."""
 _APART = "diagnostics/"
-"""Before the name of a diagnostic that is also that of another column."""
+"""Before the name of a diagnostic that is also that of another column, or begins so."""
 _OWN = ("agents", "seeds", "budgets", "agent_names", "code", "evaluation_episodes", "few_seeds", "headlines")
 """Fields in which merged benches may differ; their encoders must agree where both have one."""
 
@@ -110,13 +110,12 @@ def results_csv(result: BenchResult) -> str:
 
 def _column_of(diagnostic: str) -> str:
     """The column of a diagnostic, whatever name an agent gave it."""
-    return f"{_APART}{diagnostic}" if diagnostic in _COLUMNS else diagnostic
+    return f"{_APART}{diagnostic}" if diagnostic in _COLUMNS or diagnostic.startswith(_APART) else diagnostic
 
 
 def _name_of(column: str) -> str:
     """The inverse of :func:`_column_of`."""
-    name = column.removeprefix(_APART)
-    return name if name in _COLUMNS else column
+    return column.removeprefix(_APART)
 
 
 def _largest_part(whole: Protocol, runs: Runs, folder: Path) -> BenchResult:

@@ -197,7 +197,7 @@ def test_kept_results_say_what_their_run_folders_said(tmp_path: Path, capsys: py
 
 def test_no_diagnostic_takes_the_place_of_a_column(tmp_path: Path) -> None:
     """Whatever an agent of somebody else calls its measures."""
-    said = {"successes": 99.0, "episodes": 1.0, "seed": 7.5, "agent": 0.5, "loss": 2.0}
+    said = {"successes": 99.0, "episodes": 1.0, "seed": 7.5, "agent": 0.5, "diagnostics/seed": 3.0, "loss": 2.0}
     made = load_bench(do(tmp_path, "oracle", "random", seeds=(0, 1)))
     result = rewritten(made, lambda run, row: dataclasses.replace(row, diagnostics=said if run.seed else {}))
     for name, text in archive_files(result).items():

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
 import pytest
 
 from imagine_bench import registry
@@ -50,12 +53,16 @@ def test_facts_of_the_digest(rules, chance, optimal_return, mean_length):
 class _Endless:
     n_actions, states, start_states = 1, ((0,),), ((0,),)
 
+    def __init__(self, reward):
+        self._reward = reward
+
     def outcomes(self, macrostate, action):
-        return (Outcome(1.0, (0,), 1.0, terminated=False, success=False),)
+        return (Outcome(1.0, (0,), self._reward, terminated=False, success=False),)
 
 
 def test_the_solver_names_what_is_wrong():
     with pytest.raises(InvalidValueError, match="Horizon 0 is too short"):
         facts(EASY, 0)
-    with pytest.raises(InvalidValueError, match=r"From macrostate \(0,\) the rules allow an endless return"):
-        facts(_Endless(), 2)
+    for reward in (1.0, math.inf, math.nan):
+        with np.errstate(invalid="ignore"), pytest.raises(InvalidValueError, match="rules allow an endless"):
+            facts(_Endless(reward), 2)
