@@ -162,13 +162,13 @@ def test_a_kept_file_names_its_clone_and_its_world(tmp_path: Path, monkeypatch: 
 
 @pytest.mark.parametrize(("settings", "at_once"), [("library", 4), ("tuned", 8)])
 def test_sac_has_whole_tests_and_counted_training(settings: str, at_once: int) -> None:
-    """Periods of training are those that the library made: 25 or more in whole rounds of collection, twice."""
+    """Periods of training are those that the library made: 25, then 50, each made up to whole rounds of collection."""
     told: list[Point] = []
     short = {"reward": "dense", "time_limit_s": 0.4}
     curve = flat.learn(50, seed=3, settings=settings, every=25, tests=1, told=told.append, **short)
-    made = at_once * math.ceil(25 / at_once)
-    assert told == curve and [point.steps for point in curve] == [made, 2 * made]
-    assert [point.robot_s for point in curve] == pytest.approx([0.04 * made, 0.08 * made])
+    made = [at_once * math.ceil(wanted / at_once) for wanted in (25, 50)]
+    assert told == curve and [point.steps for point in curve] == made
+    assert [point.robot_s for point in curve] == pytest.approx([0.04 * steps for steps in made])
     assert curve[-1].train_faults == curve[-1].train_successes == 0, "no hand reaches a cube in 0.4 s"
     counts = EndCounts()
     ends = [(True, False), (False, True), (False, True), (False, False)]
@@ -212,6 +212,16 @@ def test_each_test_of_sac_counts_by_itself(monkeypatch: pytest.MonkeyPatch) -> N
     assert [(point.touched, point.successes, point.tests) for point in curve] == [(2, 1, 5)] * 2
     assert [point.mean_return for point in curve] == pytest.approx([-3.0 + 5.0 / 5] * 2)
     assert [(point.train_faults, point.train_successes) for point in curve] == [(1, 0), (2, 0)]
+
+
+@pytest.mark.parametrize(("every", "made"), [(3, [4, 8, 12, 12, 16]), (2, [4, 4, 8, 8, 12, 12])])
+def test_rounds_of_sac_never_add_up_to_more_training(
+    every: int, made: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four periods are made at once: before the fourth test 12 are wanted, and 12 were made."""
+    monkeypatch.setattr(flat, "flat_env", lambda: _Scripted("nothing"))
+    curve = flat.learn(every * len(made), seed=3, every=every, tests=1, told=lambda point: None)
+    assert [point.steps for point in curve] == made
 
 
 @pytest.mark.parametrize("seed", [-1, 10**9])

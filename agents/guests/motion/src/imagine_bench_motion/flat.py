@@ -73,7 +73,8 @@ def learn(
     """Train SAC, and test its deterministic policy now and then.
 
     Args:
-        steps: Control periods of training. The library makes a few at once, so before a test there may be some more.
+        steps: Control periods of training. The library makes four or eight at once, so before a test there may be up
+            to seven more than were asked for.
         seed: Of the library and the environments, below 10**9, where the seeds of tests begin.
         settings: A name of :data:`SETTINGS`.
         every: Steps between tests.
@@ -96,8 +97,8 @@ def learn(
     counts = EndCounts()
     began_s = time.process_time()
     curve = []
-    for _ in range(steps // every):
-        model.learn(every, reset_num_timesteps=False, callback=counts)
+    for wanted in range(every, steps + 1, every):
+        model.learn(wanted - model.num_timesteps, reset_num_timesteps=False, callback=counts)
         point = _tested(model, env, test_env, tests, counts, time.process_time() - began_s)
         told(point)
         curve.append(point)
