@@ -126,6 +126,10 @@ class ArtefactError(ImagineBenchError):
     """A file (checkpoint, encoder, result) that is missing, damaged or made by something else. It is left untouched."""
 
 
+class AbsentError(ArtefactError):
+    """A file that a kept run used, or the agent that it trained, is not on this machine."""
+
+
 class SetupError(ImagineBenchError):
     """The machine lacks something: headless GL, disk space, write permission. Names the remedy."""
 

@@ -15,7 +15,16 @@ import numpy as np
 
 from imagine_bench import registry
 from imagine_bench.data.folder import read_dataset
-from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError, plain, require
+from imagine_bench.errors import (
+    AbsentError,
+    ArtefactError,
+    ImagineBenchError,
+    InvalidValueError,
+    SetupError,
+    UnknownNameError,
+    plain,
+    require,
+)
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import Job, Launcher, RunSpec
 from imagine_bench.registry.machine import describe_environment
@@ -119,26 +128,21 @@ def train_again(folder: Path, retraining: Retraining) -> list[Verdict]:
     kept = BenchStore(folder, protocol)
     differing = _differing(kept)
     wanted = drawn(protocol, retraining.runs, retraining.nonce)
-    if protocol.dataset is None and retraining.dataset is not None:
-        raise InvalidValueError(f"No run of {folder} learned from a dataset; leave --dataset out.")
-    if retraining.dataset is not None:
-        given = read_dataset(retraining.dataset).identity
-        if given != protocol.dataset:
-            raise InvalidValueError(
-                f"{retraining.dataset} is {given}; runs of {folder} learned from {protocol.dataset}."
-            )
+    _require_dataset(folder, protocol, retraining.dataset)
     found = []
     with TemporaryDirectory(prefix="imagine-bench-verify-") as scratch:
         again = BenchStore(Path(scratch), protocol)
         jobs = list[Job]()
-        lacking = {}
-        why = {}
+        lacking = dict[tuple[str, int], str]()
+        why = dict[tuple[str, int], str]()
         for run in wanted:
             try:
                 spec = _spec(protocol, *run, retraining)
                 jobs.append(Job(spec=spec, folder=again.run_folder(*run)))
-            except ImagineBenchError as error:  # its package, encoder or dataset is not here
+            except (AbsentError, SetupError, UnknownNameError) as error:  # its package, encoder or dataset is not here
                 lacking[run] = brief_lines(error).rstrip(".")
+            except ImagineBenchError as error:
+                why[run] = str(error)
         with ProgressBar([job.spec for job in jobs]) as show:
             for failure in retraining.launcher.launch(jobs, show):
                 why[failure.job.spec.agent, failure.job.spec.seed] = failure.reason
@@ -157,12 +161,24 @@ def train_again(folder: Path, retraining: Retraining) -> list[Verdict]:
     return found
 
 
+def _require_dataset(folder: Path, protocol: Protocol, given: Path | None) -> None:
+    """Raise InvalidValueError for a dataset that the runs of a bench did not learn from."""
+    if given is None:
+        return
+    if protocol.dataset is None:
+        raise InvalidValueError(f"No run of {folder} learned from a dataset; leave --dataset out.")
+    identity = read_dataset(given).identity
+    if identity != protocol.dataset:
+        raise InvalidValueError(f"{given} is {identity}; runs of {folder} learned from {protocol.dataset}.")
+
+
 def _spec(protocol: Protocol, agent: str, seed: int, retraining: Retraining) -> RunSpec[Protocol]:
+    """The run as it was. Raises AbsentError, SetupError or UnknownNameError: this machine lacks a part of it."""
     dataset = retraining.dataset
     if registry.is_player(agent):
-        raise ArtefactError("it is a person's, or a program's elsewhere, that cannot be trained here.")
+        raise AbsentError("it is a person's, or a program's elsewhere, that cannot be trained here.")
     if protocol.dataset is not None and dataset is None and registry.agent_entry(agent).learns:
-        raise ArtefactError(f"it learned from the dataset {protocol.dataset}; give its folder with --dataset.")
+        raise AbsentError(f"it learned from the dataset {protocol.dataset}; give its folder with --dataset.")
     through = encoder_of_run(protocol, agent, retraining.encoder)
     return RunSpec(protocol=protocol, agent=agent, seed=seed, encoder=through, dataset=dataset)
 

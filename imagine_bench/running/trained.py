@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from imagine_bench import registry
-from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError
+from imagine_bench.errors import AbsentError, ArtefactError, InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.interfaces import Agent, AgentContext, AgentState, TaskSpec
 from imagine_bench.interfaces.capabilities import Imaginer, ModelOnlyTrainer
 from imagine_bench.protocols.control import Protocol, context_of
@@ -178,20 +178,30 @@ def best_run(result: Result) -> RunResult:
 
 
 def encoder_of_run(protocol: Protocol, agent: str, given: str | None) -> Path | None:
-    """The encoder that an agent saw through; ``given`` may be that of the bench's agents of the other kind."""
+    """The encoder that an agent saw through; ``given`` may be that of the bench's agents of the other kind.
+
+    Raises:
+        AbsentError: It is not here.
+        ArtefactError: It is not here, and a file of its name, or the given one, is damaged.
+        UnknownNameError: No such encoder as the given one.
+    """
     entry = registry.agent_entry(agent)
     used = protocol.encoder_of(entry.encoder_kind)
     if not entry.needs_encoder or used is None:
         return None
     here = encoders.find(used)
     path = here
+    others = encoders.of_name(used)
     if given is not None:
         path = encoders.resolve(registry.task(protocol.task), protocol.appearance, given)
+        others.append(path)
         found = encoders.identity(path)
         if found != used:
             path = here if found in (protocol.encoder, protocol.codes) else None
     if path is None:
-        raise ArtefactError(
+        for other in others:
+            encoders.card_of(other)  # raises, if it is damaged
+        raise AbsentError(
             f"The run saw through encoder {used}, which {'is not here' if given is None else f'{given} is not'}; give "
             "its file with --encoder."
         )

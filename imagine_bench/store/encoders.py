@@ -98,10 +98,14 @@ def offered(spec: TaskSpec, appearance: str, name: str) -> Path:
 
 def find(used: str) -> Path | None:
     """The bundled or trained encoder of an identity; None where there is none."""
+    return next((path for path in of_name(used) if identity(path) == used), None)
+
+
+def of_name(used: str) -> list[Path]:
+    """The bundled and trained encoders of the name in an identity, whatever their content is."""
     name = used.partition("@")[0]
     trained = sorted((cache_folder() / "encoders").glob(f"*/{name}{_SUFFIX}"))
-    there = [bundled()[name], *trained] if name in bundled() else trained
-    return next((path for path in there if identity(path) == used), None)
+    return [bundled()[name], *trained] if name in bundled() else trained
 
 
 def resolve(spec: TaskSpec, appearance: str, given: str) -> Path:

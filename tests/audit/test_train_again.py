@@ -122,6 +122,41 @@ def test_runs_of_a_dataset_that_is_not_given_are_not_compared(tmp_path: Path) ->
         verify(folder, other)
 
 
+def through_encoder(pair: Path, root: Path, used: str) -> Path:
+    """A bench whose one learner is said to have seen through an encoder."""
+    whole = forged(pair, root, lambda folder: None)
+    return rewrite_protocol(whole, agents=["dqn"], seeds=[0], encoder=used)
+
+
+def test_a_missing_encoder_is_not_compared_and_a_damaged_one_a_complaint(
+    pair: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Damaged in the cache, where its name is known, and as the file that is given."""
+    monkeypatch.setenv("IMAGINE_BENCH_CACHE", str(tmp_path / "cache"))
+    folder = through_encoder(pair, tmp_path, "mine@0123456789ab")
+    (found,) = train_again(folder, again())
+    assert not found.complaint and "through encoder mine@0123456789ab, which is not here" in found.unshown[0]
+    for damaged in (tmp_path / "given.safetensors", tmp_path / "cache" / "encoders" / "looks" / "mine.safetensors"):
+        damaged.parent.mkdir(parents=True, exist_ok=True)
+        damaged.write_bytes(b"half an encoder")
+        given = str(damaged) if damaged.parent == tmp_path else None
+        (found,) = train_again(folder, dataclasses.replace(again(), encoder=given))
+        assert found.complaint.startswith(f"it cannot be: {damaged} is not an encoder with a card")
+
+
+def test_an_absent_agent_is_not_compared_and_one_that_fails_a_complaint(pair: Path, tmp_path: Path) -> None:
+    """An agent of a script, a prefix without its argument, and an agent whose training ends in an error."""
+    for agent, complaint, unshown in (
+        ("of_a_script", "", "No agent 'of_a_script'"),
+        ("person", "it cannot be: person alone is no name", ""),
+        ("failing", "it cannot be: this agent breaks on purpose", ""),
+    ):
+        whole = forged(pair, tmp_path / agent, lambda folder: None)
+        (found,) = train_again(rewrite_protocol(whole, agents=[agent], seeds=[1]), again())
+        assert found.complaint.startswith(complaint) and bool(found.complaint) == bool(complaint)
+        assert unshown in "".join(found.unshown)
+
+
 def test_a_persons_run_is_not_trained_again(tmp_path: Path) -> None:
     played = protocol_of_player("arrow_puzzle", "person", "anna", tests=1, execution="kinematic")
     with played_run(played, tmp_path) as run:
