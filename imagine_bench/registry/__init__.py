@@ -80,6 +80,7 @@ __all__ = [
     "describe_group",
     "guest_packages",
     "guest_with",
+    "guests_faults",
     "installed_of",
     "is_ours",
     "load",
@@ -265,7 +266,7 @@ def setting_names(agent: str) -> frozenset[str]:
     """The dotted names of all settings that an agent has. Raises SetupError: its package offers them wrongly."""
     where = agent_entry(agent).settings
     with guests_faults(f"Agent {agent}, its settings", where):
-        return load(where).names() if where else frozenset()
+        return frozenset(load(where).names()) if where else frozenset()
 
 
 def inert_settings(agent: str) -> frozenset[str]:
@@ -276,7 +277,7 @@ def inert_settings(agent: str) -> frozenset[str]:
     where = agent_entry(agent).settings
     with guests_faults(f"Agent {agent}, its settings", where):
         inert = getattr(load(where), "inert", None) if where else None
-        return frozenset() if inert is None else inert()
+        return frozenset() if inert is None else frozenset(inert())
 
 
 def own_settings(agent: str, overrides: Mapping[str, Setting]) -> dict[str, Setting]:
@@ -391,8 +392,11 @@ def world_model_entry(name: str) -> WorldModelEntry:
         raise InvalidValueError(
             f"World model {one.agent} takes no settings; leave out {brief(name[len(one.agent) :])}."
         )
-    for given in one.settings:
-        require_known("setting", given, sorted(load(entry.settings).names()))
+    if one.settings:
+        with guests_faults(f"World model {name}, its settings", entry.settings):
+            known = sorted(load(entry.settings).names())
+        for given in one.settings:
+            require_known("setting", given, known)
     return entry
 
 

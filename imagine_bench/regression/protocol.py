@@ -11,7 +11,7 @@ from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.protocols.data import ProtocolData, digest, package_digests, require_different
 from imagine_bench.registry.entries import parse_configuration
-from imagine_bench.values import Setting
+from imagine_bench.values import Json, Setting
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,19 +80,27 @@ def plan(task: str, preset: str, **changes: Any) -> tuple[RegressionProtocol, di
     if preset == "smoke":
         values.setdefault("variants", registry.regression(task).variants[:2])
     wanted = RegressionProtocol(task=task, preset=preset, **values)
-    targets = {agent: registry.regressor_entry(agent).settings for agent in wanted.agents}
-    offered = {target: registry.load(target) for target in targets.values() if target}
-    for agent, target in targets.items():
-        given = wanted.overrides_of(agent)
-        if target:
-            groups = list(offered[target].groups)
-            group = parse_configuration(agent).agent
-            offered[target].resolve(wanted.hyperparameters, given, group if group in groups else groups[0])
-        elif given:
-            raise InvalidValueError(f"Regressor {agent} names no settings; leave {', '.join(sorted(given))} out.")
-    settings = [
-        asdict(each.resolve(wanted.hyperparameters, dict(wanted.overrides), group))
-        for each in offered.values()
-        for group in each.groups
-    ]
+    settings = _every_setting(wanted)
     return replace(wanted, settings_digest=digest(settings), code=package_digests(wanted.code_places())), {}
+
+
+def _every_setting(wanted: RegressionProtocol) -> list[Json]:
+    """All settings of every regressor in each of its groups, those that its name gives checked. Raises as :func:`plan`.
+
+    Also SetupError: a package offers settings wrongly.
+    """
+    found: dict[str, list[Json]] = {}
+    for agent in wanted.agents:
+        given = wanted.overrides_of(agent)
+        target = registry.regressor_entry(agent).settings
+        if not target and given:
+            raise InvalidValueError(f"Regressor {agent} names no settings; leave {', '.join(sorted(given))} out.")
+        if target:
+            with registry.guests_faults(f"Regressor {agent}, its settings", target):
+                known = registry.load(target)
+                groups = list(known.groups)
+                group = parse_configuration(agent).agent
+                known.resolve(wanted.hyperparameters, given, group if group in groups else groups[0])
+                overrides = dict(wanted.overrides)
+                found[target] = [asdict(known.resolve(wanted.hyperparameters, overrides, each)) for each in groups]
+    return [each for settings in found.values() for each in settings]

@@ -85,7 +85,8 @@ def _learner(name: str, entry: AgentEntry | RegressorEntry | WorldModelEntry) ->
         return f"{page}\n\nIt has no settings."
     colon = "," if ":" in name else ":"
     head = f"Settings of the preset quick, in brackets of others; changed in a command as {name}{colon}NAME=VALUE"
-    return f"{page}\n\n{head}\n{settings_in_words(entry.settings, cases)}"
+    with registry.guests_faults(f"{name}, its settings", entry.settings):
+        return f"{page}\n\n{head}\n{settings_in_words(entry.settings, cases)}"
 
 
 def describe_task(name: str) -> str:

@@ -112,3 +112,46 @@ def test_no_control_character_reaches_the_terminal(guests: Guests, capsys: pytes
     assert main(["describe"]) == 0
     said = capsys.readouterr().out
     assert _RED not in said and r"shy\x1b[31m" in said
+
+
+_ODD = """from imagine_bench.registry.entries import AgentEntry, RegressorEntry, WorldModelEntry
+
+class _Settings:
+    groups = {"chapter_5": None}
+
+    def resolve(self, *given):
+        return 1 // 0
+
+    inert = names = resolve
+
+def spell(argument):
+    return argument
+
+SETTINGS = _Settings()
+AGENT = AgentEntry(make="odd:make", settings="odd:SETTINGS")
+PREFIX = AgentEntry(make="odd:make", settings="odd:SETTINGS", argument="odd:spell")
+REGRESSOR = RegressorEntry(make="odd:make", settings="odd:SETTINGS", title="Odd", description="Odd.")
+MODEL = WorldModelEntry(make="odd:make", settings="odd:SETTINGS", title="Odd")
+"""
+
+
+@pytest.mark.parametrize(
+    ("offer", "words", "what"),
+    [
+        ("agents AGENT", "describe odd", "odd"),
+        ("agents PREFIX", "describe odd", "odd:ARGUMENT"),
+        ("agents AGENT", "bench arrow_puzzle --agents odd", "Agent odd"),
+        ("regressors REGRESSOR", "describe odd", "odd"),
+        ("regressors REGRESSOR", "bench robot_ik --agents odd", "Regressor odd"),
+        ("world_models MODEL", "describe odd", "odd"),
+        ("world_models MODEL", "judge arrow_puzzle --models odd:rate=1", "World model odd:rate=1"),
+    ],
+)
+def test_settings_that_fail_are_a_sentence_in_every_command(
+    guests: Guests, capsys: pytest.CaptureFixture[str], offer: str, words: str, what: str
+) -> None:
+    group, name = offer.split()
+    guests.write("odd", _ODD, {f"imagine_bench.{group}": {"odd": f"odd:{name}"}})
+    assert main(words.split()) == 2
+    said = capsys.readouterr().err
+    assert f"{what}, its settings (odd:SETTINGS) cannot be used (ZeroDivisionError: " in said and said.count("\n") == 1
