@@ -161,6 +161,27 @@ def test_a_judgement_that_cannot_be_is_one_sentence(change: dict[str, Any], sent
         replace(FEW, **change)
 
 
+_OILY = """from dataclasses import replace
+from imagine_bench import registry
+from imagine_bench.tasks.arrows.spec import spec_of
+HOLDS = replace(spec_of(cubes=2), id="oily", env_id="oily/Oily-v0")
+SLIPS = replace(spec_of(cubes=2, slip=0.2), id="oily", env_id="oily/Oily-v0")
+DRY = replace(registry.TASKS["arrows"], spec="oily:HOLDS", env_id="oily/Oily-v0", horizon=None, world="", options={})
+OILY = replace(DRY, spec="oily:SLIPS")
+"""
+
+
+def test_grips_that_slip_are_refused_without_an_option_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The task of another package, whose name and options do not say that its world slips."""
+    guests = Guests(tmp_path / "site", monkeypatch)
+    folder = guests.write("oily", _OILY, {registry.TASK_GROUP: {"oily": "oily:DRY"}})
+    assert replace(FEW, task="oily").task == "oily"
+    guests.offer(folder, {registry.TASK_GROUP: {"oily": "oily:OILY"}})
+    with pytest.raises(InvalidValueError, match="Chance decides where a motion of oily ends"):
+        replace(FEW, task="oily")
+    guests.forget()
+
+
 def test_tables_and_rows_say_what_was_measured() -> None:
     """Means over seeds by hand, with their ends; a dash where nothing was measured; the simulator learns nothing."""
     measured = {

@@ -68,12 +68,13 @@ class MotionJudgement:
         object.__setattr__(self, "task", registry.task_name(self.task))  # seeds and folder depend on it
         if not registry.task_entry(self.task).motion:
             raise InvalidValueError(f"Task {self.task} has no continuous control; give one of this suite.")
-        if registry.task(self.task).sight is not None:
+        spec = registry.task(self.task)
+        if spec.sight is not None:
             raise InvalidValueError(
                 f"Frames of {self.task} hide some of the world or are late, and motions are judged by frames that show "
                 "it as it is. Judge a task without the parameters gesture and lag."
             )
-        if registry.task_entry(self.task).options.get("slip"):
+        if getattr(getattr(spec.rules, "world", None), "slip", 0.0):  # a task may slip without options that say so
             raise InvalidValueError(
                 f"Chance decides where a motion of {self.task} ends, and one end of the simulator is taken for the "
                 "truth. Judge a task without the parameter slip."
