@@ -71,8 +71,7 @@ class ProtocolData(ABC):
         require_types(self)
         object.__setattr__(self, "agents", tuple(str(parse_configuration(agent)) for agent in self.agents))
         require_known("device", self.device, DEVICES)
-        require_seeds(self.seeds)
-        object.__setattr__(self, "seeds", tuple(sorted(self.seeds)))
+        object.__setattr__(self, "seeds", require_seeds(self.seeds))
         require_different("agents", self.agents)
 
     def as_dict(self) -> dict[str, Json]:
@@ -154,8 +153,12 @@ def require_different(name: str, values: tuple[str, ...]) -> None:
         raise InvalidValueError(f"{name} {brief(values)} must be at least one name, none of them twice.")
 
 
-def require_seeds(seeds: tuple[int, ...]) -> None:
-    """Raise InvalidValueError for seeds that are none, equal or out of range, and for tuning among reported ones."""
+def require_seeds(seeds: tuple[int, ...]) -> tuple[int, ...]:
+    """Return seeds in ascending order, as results have them.
+
+    Raises:
+        InvalidValueError: There are none, equal ones, some out of range, or tuning seeds among reported ones.
+    """
     if not seeds or len(set(seeds)) != len(seeds) or not all(0 <= seed < SEEDS for seed in seeds):
         raise InvalidValueError(f"seeds {brief(seeds)} must be one or more different integers from 0 to {SEEDS - 1}.")
     if len({is_tuning_seed(seed) for seed in seeds}) > 1:
@@ -163,6 +166,7 @@ def require_seeds(seeds: tuple[int, ...]) -> None:
             f"seeds {seeds} mix tuning seeds (from {TUNING_SEEDS} on, tested on starts of their own) with "
             "reported ones; give them to separate benches."
         )
+    return tuple(sorted(seeds))
 
 
 P = TypeVar("P", bound=ProtocolData)

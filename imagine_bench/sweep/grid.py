@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 from imagine_bench import registry
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, brief, require_known, why
 from imagine_bench.protocols.control import Protocol
-from imagine_bench.protocols.data import digest, require_types
+from imagine_bench.protocols.data import digest, require_seeds, require_types
 from imagine_bench.seeding import TUNING_SEEDS, is_tuning_seed
 from imagine_bench.values import Setting, dotted
 
@@ -66,7 +66,10 @@ class Variant:
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """A study. Raises InvalidValueError: a name given twice, a comparison with nothing, or a seed of reported runs."""
+    """A study.
+
+    Raises InvalidValueError: a name or a seed given twice, a comparison with nothing, or a seed of reported runs.
+    """
 
     name: str  #: Its name on the command line
     question: str  #: One sentence for the reader of its page
@@ -86,12 +89,12 @@ class Study:
                 raise InvalidValueError(
                     f"Variant {variant.name!r} is compared with {variant.against!r}, which the study lacks: {names}."
                 )
-        object.__setattr__(self, "seeds", tuple(sorted(self.seeds)))  # as results have them
         if not self.seeds or not all(map(is_tuning_seed, self.seeds)):
             raise InvalidValueError(
                 f"Study {self.name!r} chooses settings on seeds {self.seeds}; give seeds from {TUNING_SEEDS} on, which "
                 "are tested on starts of their own."
             )
+        object.__setattr__(self, "seeds", require_seeds(self.seeds))
 
     def only(self, names: Sequence[str]) -> Study:
         """The study with the named variants, or all, and those they are compared with. Raises UnknownNameError."""
@@ -146,7 +149,10 @@ class Experiment:
 
 @dataclass(frozen=True, kw_only=True)
 class Suite:
-    """Experiments, and the protocol fields that all of them share. Raises InvalidValueError: a name given twice."""
+    """Experiments, and the protocol fields that all of them share.
+
+    Raises InvalidValueError: a name given twice, or seeds that no bench takes.
+    """
 
     name: str
     experiments: tuple[Experiment, ...]
@@ -159,7 +165,7 @@ class Suite:
 
     def __post_init__(self) -> None:
         require_types(self)
-        object.__setattr__(self, "seeds", tuple(sorted(self.seeds)))  # as results have them
+        object.__setattr__(self, "seeds", require_seeds(self.seeds))
         _require_names(self.name, "experiments", self.experiments)
         for each in self.experiments:
             _require_names(self.name, f"levels of {each.name}", each.levels)

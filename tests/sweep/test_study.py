@@ -120,6 +120,7 @@ def test_a_difference_is_that_from_what_a_variant_is_compared_with(tmp_path: Pat
     ("changes", "message"),
     [
         ({"seeds": (0, 1)}, r"chooses settings on seeds \(0, 1\); give seeds from 1000 on"),
+        ({"seeds": (1001, 1001)}, r"^seeds \(1001, 1001\) must be one or more different integers"),
         ({"variants": STUDY.variants[:1] * 2}, "each name once"),
         ({"variants": STUDY.variants[1:]}, "'mild' is compared with 'table', which the study lacks"),
     ],

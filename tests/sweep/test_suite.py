@@ -244,6 +244,13 @@ def test_a_level_that_its_scores_would_misstate_is_refused(fields, sentence):
         Level(name="3", task="arrows", protocol=fields)
 
 
+@pytest.mark.parametrize("seeds", [(), (1, 1), (-1,), (0, 1000)])
+def test_seeds_that_no_bench_takes_are_refused_by_a_suite(seeds):
+    with pytest.raises(InvalidValueError, match=r"^seeds .* (must be one or more different integers|mix tuning seeds)"):
+        dataclasses.replace(TINY, seeds=seeds)
+    assert dataclasses.replace(TINY, seeds=(3, 0, 2)).seeds == (0, 2, 3)
+
+
 def test_auroc_without_imagined_rollouts_is_refused():
     silent = Level(name="5", task="arrows", episodes=5)
     with pytest.raises(InvalidValueError, match=r"its levels \['5'\] have no rollouts to measure"):
