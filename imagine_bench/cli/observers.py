@@ -81,7 +81,7 @@ class BenchObserver(RunObserver):
             found["sampled_rollouts"] = imagine_sampled_rollouts(run.agent, run.task, seeds=seeds, **_in_tests(run))
         recorded = run.protocol.seeds[: run.protocol.recorded_seeds or None]
         if run.protocol.recorded_episodes > 0 and run.spec.seed in recorded:
-            from imagine_bench.recording.episodes import record_run  # noqa: PLC0415 - loading Rerun costs a second
+            from imagine_bench.recording.episodes import record_run  # noqa: PLC0415 - Rerun loads slowly
 
             run.tell("recording", at_once=True)
             with closing(make_env(run.protocol, run.protocol.task, testing=True)) as env:

@@ -161,7 +161,7 @@ class LocalPool:
 def _foreign(job: Job) -> bool:
     """Whether a run is of other packages, whose code may change its whole process; ours may share one.
 
-    Loading torch, MuJoCo and the like once a worker instead of once a run saves four CPU seconds a run.
+    So torch, MuJoCo and the like are loaded once a worker instead of once a run.
     """
     task = job.spec.protocol.task
     return not registry.is_own(task) or not registry.is_ours(registry.agent_entry(job.spec.agent).make)

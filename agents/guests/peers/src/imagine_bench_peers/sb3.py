@@ -46,7 +46,7 @@ class LibraryAgent:
     ) -> None:
         prepare_torch(context.device)
         self._algorithm = _load(algorithm)
-        importlib.import_module("torch._dynamo")  # else the first optimiser imports it: a second that is no training
+        importlib.import_module("torch._dynamo")  # else the first optimiser imports it, in the time of training
         self._device = context.device
         self.settings = hyperparameters.of(context)
         self._keywords = self.settings.ppo if algorithm.endswith(":PPO") else self.settings.sb3
