@@ -100,7 +100,10 @@ def describe_task(name: str) -> str:
         data = registry.regression(name)
         rows = {"learned from": f"data, in the variants {', '.join(data.variants)}", "error": data.error_name}
         return _page(data.title, data.description, rows)
-    spec = registry.task(registry.task_of_motion(name) or name)
+    by_motion = registry.task_of_motion(name)
+    spec = registry.task(by_motion or name)
+    if by_motion:
+        _require_motion(spec)
     facts = spec.facts()
     exact = certificate(spec)
     factors = (f"{n} ({', '.join(v)})" for n, v in zip(spec.macrostate_names, spec.macrostate_values, strict=True))
@@ -124,11 +127,12 @@ def describe_task(name: str) -> str:
         **_with_best_known(certificate_rows(exact), spec.id),
         "encoders": _encoders(spec),
     }
-    hand = _by_hand(spec)
-    if registry.task_of_motion(name):
-        _require_motion(spec)
+    if by_motion:
+        hand = _by_hand(spec)
         return _page(spec.title, spec.description, hand | {"rules": "those of its macro-actions:"} | rows)
-    return _page(spec.title, spec.description, rows | dict(list(hand.items())[1:2]))
+    if _has_motion(spec):
+        rows |= dict(list(_by_hand(spec).items())[1:2])
+    return _page(spec.title, spec.description, rows)
 
 
 def _optimum(exact: Certificate) -> str:
@@ -160,15 +164,21 @@ def _require_motion(spec: TaskSpec) -> None:
         world.require_motion()
 
 
-def _by_hand(spec: TaskSpec) -> dict[str, str]:
-    """A task in continuous control, and how far it can be solved; nothing where it has none."""
-    base, colon, options = spec.id.partition(":")
+def _has_motion(spec: TaskSpec) -> bool:
+    """Whether a task has an environment of continuous control."""
+    base = spec.id.partition(":")[0]
     if not registry.has_task(base) or not registry.task_entry(base).motion:
-        return {}
+        return False
     try:
         _require_motion(spec)
     except InvalidValueError:
-        return {}
+        return False
+    return True
+
+
+def _by_hand(spec: TaskSpec) -> dict[str, str]:
+    """A task in continuous control, and how far it can be solved."""
+    base, colon, options = spec.id.partition(":")
     made_by = registry.motion_id(registry.task_entry(base).env_id)
     name = registry.motion_name(made_by)
     made_by += f", with {options.replace(',', ', ')}" if options else ""

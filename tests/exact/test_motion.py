@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
+from imagine_bench.tasks.arrows.rules import Arrows
 
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
@@ -122,3 +124,17 @@ def test_no_certificate_of_commands_where_there_are_none(option: str) -> None:
     assert "\nby hand  " not in describe(f"arrows:cubes=2,{option}")
     with pytest.raises(InvalidValueError, match="leave it out at this level"):
         describe(f"ArrowsMotion:cubes=2,{option}")
+
+
+@pytest.mark.parametrize("name", ["ArrowsMotion:cubes=2", "arrows:cubes=2"])
+def test_a_described_world_is_asked_once_whether_a_hand_can_act(name: str) -> None:
+    """And before its exact facts are computed, where one that cannot is described as continuous control."""
+    can = mock.Mock()
+    with mock.patch.object(Arrows, "require_motion", can):
+        describe(name)
+    assert can.call_count == 1
+    with (
+        mock.patch("imagine_bench.tools.describe.certificate", side_effect=AssertionError("computed")),
+        pytest.raises(InvalidValueError, match="leave it out at this level"),
+    ):
+        describe("ArrowsMotion:cubes=2,coupling=neighbour")
