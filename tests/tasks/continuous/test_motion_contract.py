@@ -38,13 +38,20 @@ def test_physics_of_a_planner_is_refused(name: str, value: float | str) -> None:
     make_arrows(physics={name: getattr(PhysicsSettings, name), "pad_friction": 0.5}, observation="proprio").close()
 
 
-@pytest.mark.parametrize(("rate_hz", "images"), [(25, 25), (125, 125), (62.5, 62), (12.5, 12)])
+@pytest.mark.parametrize(("rate_hz", "images"), [(25, 25), (125, 125), (62.5, 62), (12.5, 12), (5, 5)])
 def test_videos_have_as_many_images_a_second_as_commands(rate_hz: float, images: int) -> None:
     """Of single environments and of lanes, for what records or plays images in simulated time."""
     options = {"rate_hz": rate_hz, "observation": "proprio", "render_mode": "rgb_array"}
     one = gymnasium.make("imagine_bench/ArrowPuzzleEasyMotion-v0", **options)
     many = gymnasium.make_vec("imagine_bench/ArrowPuzzleEasyMotion-vector-v0", num_envs=1, **options)
     assert [env.metadata["render_fps"] for env in (one, many)] == [images] * 2
+
+
+@pytest.mark.parametrize("rate_hz", [0.5, 4.9, 126, 0, float("nan")])
+def test_rates_below_5_hz_or_above_the_simulations_are_refused(rate_hz: float) -> None:
+    """So the images a second of a video are never rounded to none."""
+    with pytest.raises(InvalidValueError, match=r"^Rate .* must be a number of Hz from 5 to 125\.$"):
+        make_arrows(rate_hz=rate_hz, observation="proprio")
 
 
 @pytest.mark.parametrize(
