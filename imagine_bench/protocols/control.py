@@ -380,6 +380,7 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     wanted = dataclasses.replace(wanted, code=tuple(sorted(code)))
     for agent in wanted.agents:  # a protocol that is only read may be of a package that is not here
         _require_takes(agent, wanted)
+        _require_exact_world(agent, wanted)
     _require_learner(wanted)
     require_same_world(wanted.task, wanted.after)
     return wanted
@@ -440,6 +441,22 @@ def _require_takes(agent: str, wanted: Protocol) -> None:
         raise InvalidValueError(
             f"Agent {agent!r} takes {', '.join(takes) or '64 x 64 frames'} alone; leave it out, or the observation "
             "as it is by default."
+        )
+
+
+def _require_exact_world(agent: str, wanted: Protocol) -> None:
+    """Raise UnableError for an agent that needs the exact world where none is given."""
+    if not agent_entry(agent).needs_exact_world:
+        return
+    if task(wanted.task).sight is not None:
+        raise UnableError(
+            f"Agent {agent!r} imagines from true macrostates, and frames of {wanted.task} hide a part of them or are "
+            "late; leave it out, or the parameters gesture and lag."
+        )
+    if wanted.after:
+        raise UnableError(
+            f"Agent {agent!r} is given the exact rules of one task, and here another comes before; leave --after out, "
+            "or that agent."
         )
 
 

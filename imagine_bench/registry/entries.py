@@ -55,7 +55,7 @@ class AgentEntry:
 
     Raises:
         UnknownNameError: No such kind of encoder, or no such part of an observation.
-        InvalidValueError: The relative cost is not above 0.
+        InvalidValueError: The relative cost is not above 0, or the exact world is for an agent that is not privileged.
     """
 
     make: str | CodeByValue  #: ``"module:attr"`` of a function from AgentContext to Agent, or the function itself
@@ -66,6 +66,9 @@ class AgentEntry:
     #: group)``; by default it has none.
     settings: str = ""
     privileged: bool = False  #: Whether it is shown the macrostate and the rules; no fair comparison
+    #: Whether it cannot do without :attr:`.AgentContext.exact_world`, which there is where frames hide nothing and no
+    #: other task comes before; elsewhere a bench refuses it
+    needs_exact_world: bool = False
     #: Whether it is a person, or a program elsewhere, whose episodes are kept as a run; nothing here can act for it
     is_player: bool = False
     #: Parts of :data:`.interfaces.OBSERVATIONS` that it can take, images of any size; by default 64 x 64 frames alone
@@ -86,6 +89,8 @@ class AgentEntry:
             require_known("part of an observation", part, OBSERVATIONS)
         if not 0.0 < self.relative_cost < math.inf:
             raise InvalidValueError(f"relative_cost is {brief(self.relative_cost)}; give a number above 0.")
+        if self.needs_exact_world and not self.privileged:
+            raise InvalidValueError("An agent that needs the exact world is privileged; register it so.")
 
 
 @dataclass(frozen=True, kw_only=True)

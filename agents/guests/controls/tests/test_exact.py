@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -15,10 +16,11 @@ from imagine_bench_controls import exact
 from imagine_bench_controls.exact import ExactFilterAgent, ExactImaginationAgent
 
 from imagine_bench import registry
-from imagine_bench.errors import InvalidValueError
+from imagine_bench.errors import InvalidValueError, UnableError
 from imagine_bench.interfaces import ExactWorld, Outcome, Transition
 from imagine_bench.protocols.control import context_of, protocol
 from imagine_bench.protocols.data import RunSpec
+from imagine_bench.running.bench import plan
 
 STATES = 6
 GOAL = 5
@@ -132,10 +134,25 @@ def test_only_who_is_given_the_world_imagines_exactly() -> None:
 
 @pytest.mark.parametrize("agent", ["imagination_exact", "imagination_exact_filter"])
 def test_the_rules_of_a_task_are_not_taken_for_those_of_the_tasks_before_it(agent: str) -> None:
-    before = {"after": ("arrow_puzzle_hard",), "unannounced": True}
-    given = [
-        context_of(RunSpec(protocol=protocol("arrow_puzzle", "smoke", agents=(agent,), **more), agent=agent, seed=0))
-        for more in ({}, before)
-    ]
+    alone = protocol("arrow_puzzle", "smoke", agents=(agent,))
+    after = replace(alone, after=("arrow_puzzle_hard",), unannounced=True)
+    given = [context_of(RunSpec(protocol=each, agent=agent, seed=0)) for each in (alone, after)]
     assert given[0].exact_world is not None
     assert given[1].exact_world is None
+    with pytest.raises(UnableError, match=f"^Agent '{agent}' is given the exact rules of one task"):
+        protocol("arrow_puzzle", "smoke", agents=(agent,), after=("arrow_puzzle_hard",), unannounced=True)
+
+
+@pytest.mark.parametrize("agent", [name for name, entry in registry.agents().items() if entry.privileged])
+@pytest.mark.parametrize("world", ["arrows:cubes=2,gesture=first", "arrows:cubes=2,lag=1"])
+def test_a_privileged_agent_is_refused_where_it_cannot_be_made(agent: str, world: str) -> None:
+    """Before an encoder is trained; every other one is made in a world that hides something."""
+    if not registry.agent_entry(agent).needs_exact_world:
+        wanted = protocol(world, "smoke", agents=(agent,))
+        registry.make_agent(agent, context_of(RunSpec(protocol=wanted, agent=agent, seed=0)))
+        return
+    with (
+        mock.patch("imagine_bench.store.encoders.own", side_effect=AssertionError("trained")),
+        pytest.raises(UnableError, match=f"^Agent '{agent}' imagines from true macrostates, and frames of .* hide"),
+    ):
+        plan(world, "smoke", agents=(agent,))

@@ -30,6 +30,7 @@ IMAGINATION_EXACT = AgentEntry(
     make="imagine_bench_controls.exact:make",
     settings="imagine_bench.agents.imagination.settings:HYPERPARAMETERS",
     privileged=True,
+    needs_exact_world=True,
     title="imagination, exact model",
     description="A control (privileged): like imagination, with the rules and rendered frames for its world model.",
 )
@@ -37,6 +38,7 @@ IMAGINATION_EXACT_FILTER = AgentEntry(
     make="imagine_bench_controls.exact:make_filter",
     settings="imagine_bench.agents.imagination.settings:HYPERPARAMETERS",
     privileged=True,
+    needs_exact_world=True,
     title="imagination, exact filter",
     description="A control (privileged): like imagination, but it learns only from imagined transitions that are "
     "right by the rules.",
