@@ -217,6 +217,24 @@ def test_a_grip_is_as_firm_as_its_physics_also_after_a_slip(physics: dict[str, f
     assert np.diff(events).tolist() == [int(holds and not slips) for slips in slipped]
 
 
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_measured_slip_is_as_ruled_and_a_weak_grip_is_not(family: str) -> None:
+    """Of fingers without force, which move nothing as ruled, those segments alone are right whose grip slips."""
+
+    def right(slip: float, **physics: float) -> tuple[int, int]:
+        env = FAMILIES[family](observation="proprio", slip=slip, physics=physics)
+        found = measure(env, tries=12, turns=0)
+        tries, as_ruled = np.array([each[2:4] for each in found.segments]).T.sum(axis=1)
+        assert sum(found.faults.values()) == tries - as_ruled or len(found.faults) == 10, "the ten most frequent"
+        return int(as_ruled), int(tries)
+
+    all_right, tries = right(0.5)
+    assert all_right == tries >= 12
+    assert right(0.0, finger_force_n=0.3) == (0, tries)
+    slipped, _ = right(0.5, finger_force_n=0.3)
+    assert 0 < slipped < tries
+
+
 @pytest.mark.parametrize("pad_friction", [0.01, 0.5, 2.0])
 def test_a_grip_that_slips_never_has_more_friction_than_one_that_holds(pad_friction: float) -> None:
     world = make_pick_place(observation="proprio", physics={"pad_friction": pad_friction}).world
