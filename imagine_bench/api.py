@@ -147,14 +147,16 @@ class Comparison:
     def show_recording(self, run: str = "") -> None:
         """Show a recording in the Rerun viewer: in the cell of a notebook, elsewhere in a window of its own.
 
-        ``run`` is a part of its path below :attr:`folder`, such as ``"dqn/seed_0"``; by default it is the last one.
+        ``run`` names whole parts of its path below :attr:`folder`, such as ``"dqn/seed_0"`` or ``"dqn"``. Of several
+        that fit the last one is shown.
 
         Raises:
             ArtefactError: There is no such recording.
             SetupError: There is no display, or the extra ``rerun``, or in a notebook ``notebook``, is not installed.
         """
         found = {path.relative_to(self.folder).as_posix(): path for path in sorted(self.folder.rglob("*.rrd"))}
-        fits = [name for name in found if run in name]
+        parts = f"/{run.strip('/')}/" if run else "/"
+        fits = [name for name in found if parts in f"/{name}/"]
         if not fits:
             raise ArtefactError(f"{self.folder} has no recording {run!r}; it has {', '.join(found) or 'none'}.")
         show = "show_in_notebook" if _NOTEBOOK in sys.modules else "open_in_viewer"
@@ -212,7 +214,7 @@ def bench(
     """
     registry.refuse_while_loading()
     task = _fitting("task", _plain(task), str)
-    root = expanded(Path(_fitting("out", _plain(out), str)))
+    root = expanded(Path(_fitting("out", _plain(out), str))).absolute()  # the process may go elsewhere afterwards
     processes = None if workers is None else _fitting("workers", _plain(workers), int)
     several: list[Any] = list(agents) if isinstance(agents, list | tuple | np.ndarray | Iterator) else [agents]
     if agents is not None and not all(isinstance(agent, str) or callable(agent) for agent in several):
@@ -374,7 +376,7 @@ def load(path: Path | str) -> Comparison:
     Raises:
         ArtefactError: There are no results in the folder, or a file is damaged.
     """
-    folder = expanded(Path(_fitting("path", _plain(path), str)))
+    folder = expanded(Path(_fitting("path", _plain(path), str))).absolute()
     places = [place for place in (folder, folder / "report") if place.is_dir()]
     for place in places:
         if (place / "protocol.json").exists() or (is_archive(place) and "variants" not in read_protocol_values(place)):

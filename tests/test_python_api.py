@@ -234,6 +234,35 @@ def test_a_frame_is_the_table_of_the_report(results: api.Comparison, monkeypatch
     assert kind == "pandas" and list(columns)[:3] == ["agent", "seed", "episodes"]
 
 
+@pytest.mark.parametrize(
+    ("asked", "shown"),
+    [("dqn/seed_1", "dqn/seed_1"), ("dqn", "dqn/seed_12"), ("seed_1", "sb3_dqn/seed_1"), ("", "sb3_dqn/seed_1")],
+)
+def test_a_recording_is_chosen_by_whole_parts_of_its_path(
+    asked: str, shown: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for run in ("dqn/seed_1", "dqn/seed_12", "sb3_dqn/seed_1"):
+        (tmp_path / run).mkdir(parents=True)
+        (tmp_path / run / "recording.rrd").touch()
+    opened: list[Path] = []
+    monkeypatch.setattr("imagine_bench.recording.stream.open_in_viewer", opened.append)
+    api.Comparison(tmp_path, None).show_recording(asked)
+    assert opened == [tmp_path / shown / "recording.rrd"]
+
+
+def test_results_stay_where_they_are_if_the_process_goes_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    made = imagine_bench.bench("arrow_puzzle", agents=["random"], out="runs", **TWO_EPISODES)
+    found = imagine_bench.load(made.folder.relative_to(tmp_path))
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    for results in (made, found):
+        assert results.report() == made.folder / "report/index.html"
+    assert made.folder.is_relative_to(tmp_path / "runs") and not list(Path.cwd().iterdir())
+
+
 def test_a_home_folder_is_meant_by_its_sign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where results are written, where they are read, and the file of an encoder."""
     monkeypatch.setenv("HOME", str(tmp_path))
