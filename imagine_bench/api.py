@@ -55,8 +55,8 @@ _SETTINGS = ("set", "physics")
 """Options that are mappings."""
 _OWN = ("preset", "workers", "launcher", "track", "out")
 """Keywords of :func:`bench` that are no part of a protocol."""
-_TEXT = ("solved", "protocol")
-"""Columns whose digits are a text."""
+_TEXT = ("agent", "model", "solved", "protocol")
+"""Columns of texts, also where they could be read as numbers: an agent may be called ``inf``."""
 
 
 @dataclass(frozen=True, repr=False)

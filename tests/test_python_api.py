@@ -19,12 +19,13 @@ from typing import Any
 import cloudpickle
 import numpy as np
 import pytest
+import torch
 from imagine_bench.agents.baselines import RandomAgent
 from kept import RESULTS, table
 from small_runs import TWO_EPISODES
 
 import imagine_bench
-from imagine_bench import api, cli, registry
+from imagine_bench import api, cli, registry, values
 from imagine_bench.errors import (
     ArtefactError,
     ImagineBenchError,
@@ -232,6 +233,20 @@ def test_a_frame_is_the_table_of_the_report(results: api.Comparison, monkeypatch
     monkeypatch.setitem(sys.modules, "pandas", pandas)
     kind, columns = results.frame()
     assert kind == "pandas" and list(columns)[:3] == ["agent", "seed", "episodes"]
+
+
+def test_diagnostics_of_any_kind_of_number_are_read_again_from_a_report(tmp_path: Path) -> None:
+    class Measured(Shifting):
+        def diagnostics(self) -> dict[str, Any]:
+            return {"done": True, "small": np.float32(0.5), "tensor": torch.tensor(2.0), "steps": 3}
+
+    imagine_bench.register_agent("inf", Measured)
+    page = imagine_bench.bench("arrow_puzzle", agents=["inf"], out=tmp_path, **TWO_EPISODES).report()
+    frame = imagine_bench.load(page.parent).frame()
+    assert set(frame["agent"]) == {"inf"}, "a name, and no number"
+    assert [float(frame[name][0]) for name in ("done", "small", "tensor", "steps")] == [1.0, 0.5, 2.0, 3.0]
+    with pytest.raises(InvalidValueError, match=r"diagnostic 'many' is array\(\[1, 2\]\); give a number"):
+        values.numbers({"many": np.array([1, 2])})
 
 
 @pytest.mark.parametrize(
