@@ -31,7 +31,7 @@ from imagine_bench.judge.judgement import Judgement
 from imagine_bench.protocols.data import Result
 from imagine_bench.registry.builtin import OUR_AGENTS
 from imagine_bench.registry.by_value import CodeByValue
-from imagine_bench.registry.entries import AgentEntry, parse_settings
+from imagine_bench.registry.entries import AgentEntry, agent_label, parse_settings
 from imagine_bench.registry.machine import CALL
 from imagine_bench.running import bench as benches
 from imagine_bench.running.launchers.jobs import launcher as launcher_named
@@ -68,6 +68,8 @@ class Comparison:
 
     folder: Path  #: where they lie
     make_page: Callable[[], Page] | None  #: makes the report; None where tables alone were kept
+    #: today's name of an agent in the table ``results``, whose file has the name of its time
+    label: Callable[[str], str] = str
 
     def __repr__(self) -> str:
         return f"{', '.join(self.tables)} in {self.folder}" if self.make_page is None else self.page.summary
@@ -99,7 +101,7 @@ class Comparison:
         """A table: a pandas DataFrame, or a dict of numpy arrays by column where pandas is not installed.
 
         ``table`` is a name in :attr:`tables`, by default the first. A column of numbers has int64 or, with empty cells
-        as NaN, float64; any other has text.
+        as NaN, float64; any other has text. Agents of a bench have today's names, also where the file has former ones.
 
         Raises:
             UnknownNameError: No such table.
@@ -108,6 +110,8 @@ class Comparison:
         header, *rows = csv.reader(io.StringIO(text))
         cells = zip(*rows, strict=True) if rows else [()] * len(header)
         columns = {name: _column(name, column) for name, column in zip(header, cells, strict=True)}
+        if table in ("", "results") and "agent" in columns:
+            columns["agent"] = np.array([self.label(agent) for agent in columns["agent"].tolist()])
         try:
             import pandas  # noqa: PLC0415 - no dependency
         except ImportError:
@@ -395,7 +399,8 @@ def load(path: Path | str) -> Comparison:
 
 
 def _of_bench(result: Result) -> Comparison:
-    return Comparison(result.folder, lambda: page_of(result))
+    edition: dict[str, object] = {"agent_names": result.protocol.agent_names}
+    return Comparison(result.folder, lambda: page_of(result), lambda agent: agent_label(agent, edition))
 
 
 def _page_of_judgement(folder: Path) -> Page:
