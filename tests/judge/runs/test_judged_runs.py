@@ -116,6 +116,8 @@ def test_runs_that_cannot_be_judged_say_why(runs: dict[str, Path], tmp_path: Pat
         visited("table", "arrow_puzzle")
     with pytest.raises(InvalidValueError, match="learned arrow_puzzle, not pick_place"):
         visited("imaginer", "pick_place")
+    with pytest.raises(ArtefactError, match="no run of an agent in runs/elsewhere/seed_0, seen from"):
+        model_entry("runs/elsewhere/seed_0")
     found = visited("imaginer", "arrow_puzzle")
     assert found and len(found) <= 2 * 20, "its experience is the one that the bench counted"
     assert all(len(state) == 4 and 0 <= action < 6 for state, action in found)
