@@ -16,7 +16,7 @@ import numpy as np
 
 from imagine_bench import registry
 from imagine_bench.arrays import Arrays, Floats, Frame, Ints, State
-from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import AgentContext, TaskSpec
 from imagine_bench.interfaces.capabilities import Imaginer, begin_episode
 from imagine_bench.interfaces.episodes import Episodes
@@ -293,11 +293,19 @@ def model_entry(model: str) -> WorldModelEntry:
 
     Raises:
         UnknownNameError: No such world model.
-        ArtefactError: This process does not know the agent.
+        ArtefactError: This process does not know the agent, or a path of no run.
     """
     runs = runs_of(model)
     if not runs:
-        return registry.world_model_entry(model)
+        try:
+            return registry.world_model_entry(model)
+        except UnknownNameError:
+            if len(Path(model).parts) == 1:
+                raise
+            raise ArtefactError(
+                f"There is no run of an agent in {model}, seen from {Path.cwd()}. A judgement of runs is read from the "
+                "folder in which it was made, while the runs are there."
+            ) from None
     seed, folder = next(iter(runs.items()))
     config = read_sealed(folder / _CONFIG, "a run's configuration")
     agent = agent_label(config["agent"], config["protocol"])
