@@ -169,6 +169,12 @@ def test_an_appearance_that_is_asked_for_is_that_of_the_tests(tmp_path: Path) ->
         assert wanted.appearance_in_tests == found
 
 
+def test_no_player_trains_on_the_fragments_of_its_tests() -> None:
+    assert wanted(appearance="patched").appearance_in_tests == "photo_held_out"
+    with pytest.raises(InvalidValueError, match="The appearance patched .* trains otherwise than it tests"):
+        wanted(appearance="patched", training=1)
+
+
 def test_nothing_of_the_learners_of_a_bench_is_said_of_a_player(tmp_path: Path) -> None:
     plain = protocol("arrow_puzzle", "smoke", agents=("dqn",))
     made = {"encoder": "a@0123456789ab", "codes": "c@ba9876543210", "code": (("dqn", "1"),), "settings_digest": "one"}
