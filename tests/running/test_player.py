@@ -173,7 +173,7 @@ def test_an_appearance_that_is_asked_for_is_that_of_the_tests(tmp_path: Path) ->
 
 def test_no_player_trains_on_the_fragments_of_its_tests() -> None:
     assert wanted(appearance="patched").appearance_in_tests == "photo_held_out"
-    with pytest.raises(InvalidValueError, match="The appearance patched .* trains otherwise than it tests"):
+    with pytest.raises(InvalidValueError, match=r"The appearance patched .* trains otherwise than it tests"):
         wanted(appearance="patched", training=1)
 
 

@@ -199,7 +199,7 @@ def test_separating_names_its_agents_and_hides_the_changed_rule():
 
 def test_no_learner_is_scored_without_the_unannounced_change():
     changed = {each.name: each.levels for each in GRIDS["separating"].experiments}["changed_rule"][0]
-    with pytest.raises(UnableError, match="'sb3_dqn' .*, or that agent"):
+    with pytest.raises(UnableError, match=r"'sb3_dqn' .*, or that agent"):
         plan_level(GRIDS["separating"], changed, "sb3_dqn")
 
 
