@@ -198,7 +198,7 @@ def source_of(
 
     Raises:
         UnknownNameError: No such model.
-        InvalidValueError: The agent of the run learned another task.
+        InvalidValueError: The agent of the run learned another task, or a teacher's feedback.
         ArtefactError: The run, or the encoder, cannot be read.
     """
     entry = model_entry(name)
@@ -212,6 +212,11 @@ def source_of(
         learned = kept.spec.protocol.task
         if registry.task(learned).id != spec.id:
             raise InvalidValueError(f"{name} learned {learned}, not {spec.id}; give a run of {spec.id}.")
+        if kept.spec.protocol.feedback:
+            raise InvalidValueError(
+                f"{name} learned rewards with a teacher's feedback in them, which the rules do not know; give a run "
+                "without --feedback."
+            )
         seen_through = kept.spec.encoder
         return ModelSource(name=name, make=entry.make, kept=kept, privileged=entry.privileged, encoder=seen_through)
     if entry.privileged:

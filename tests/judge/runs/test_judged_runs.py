@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from small_runs import Inline, do, small
 
@@ -141,6 +142,16 @@ def test_the_experience_of_a_run_is_not_known_where_others_were_learned_from(tmp
     source = dataclasses.replace(_source(str(run.folder), "arrow_puzzle"), privileged=True)
     with opened(source, "arrow_puzzle", folder=tmp_path, log=tmp_path / "log") as judged:
         assert judged.visited is None and not judged.learns
+
+
+def test_rewards_with_feedback_in_them_are_not_compared_with_the_rules(tmp_path: Path) -> None:
+    options = {"agents": ("imaginer",), "budgets": (2,), "open_loop_starts": 2}
+    plain = do(tmp_path / "plain", "imaginer", **options)
+    taught = do(tmp_path / "taught", "imaginer", feedback=5.0, **options)
+    errors = [run.checkpoints[0].open_loop.reward_mae for run in (plain, taught)]  # type: ignore[union-attr]
+    assert np.isfinite(errors[0]).all() and np.isnan(errors[1]).all()
+    with pytest.raises(InvalidValueError, match="a teacher's feedback in them"):
+        _source(str(taught.folder), "arrow_puzzle")
 
 
 _TWICE = ("mdn_thesis:model.members=2,model.dropout=0.1", "copy", "mdn_thesis:model.dropout=0.1,model.members=2")
