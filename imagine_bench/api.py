@@ -31,7 +31,7 @@ from imagine_bench.judge.judgement import Judgement
 from imagine_bench.protocols.data import Result
 from imagine_bench.registry.builtin import OUR_AGENTS
 from imagine_bench.registry.by_value import CodeByValue
-from imagine_bench.registry.entries import AgentEntry, parse_settings
+from imagine_bench.registry.entries import AgentEntry, agent_label, parse_settings
 from imagine_bench.registry.machine import CALL
 from imagine_bench.running import bench as benches
 from imagine_bench.running.launchers.jobs import launcher as launcher_named
@@ -55,8 +55,8 @@ _SETTINGS = ("set", "physics")
 """Options that are mappings."""
 _OWN = ("preset", "workers", "launcher", "track", "out")
 """Keywords of :func:`bench` that are no part of a protocol."""
-_TEXT = ("solved", "protocol")
-"""Columns whose digits are a text."""
+_TEXT = ("agent", "model", "solved", "protocol")
+"""Columns of texts, also where they could be read as numbers: an agent may be called ``inf``."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -68,6 +68,8 @@ class Comparison:
 
     folder: Path  #: where they lie
     make_page: Callable[[], Page] | None  #: makes the report; None where tables alone were kept
+    #: today's name of an agent in the table ``results``, whose file has the name of its time
+    label: Callable[[str], str] = str
 
     def __repr__(self) -> str:
         return f"{', '.join(self.tables)} in {self.folder}" if self.make_page is None else self.page.summary
@@ -99,7 +101,7 @@ class Comparison:
         """A table: a pandas DataFrame, or a dict of numpy arrays by column where pandas is not installed.
 
         ``table`` is a name in :attr:`tables`, by default the first. A column of numbers has int64 or, with empty cells
-        as NaN, float64; any other has text.
+        as NaN, float64; any other has text. Agents of a bench have today's names, also where the file has former ones.
 
         Raises:
             UnknownNameError: No such table.
@@ -108,6 +110,8 @@ class Comparison:
         header, *rows = csv.reader(io.StringIO(text))
         cells = zip(*rows, strict=True) if rows else [()] * len(header)
         columns = {name: _column(name, column) for name, column in zip(header, cells, strict=True)}
+        if table in ("", "results") and "agent" in columns:
+            columns["agent"] = np.array([self.label(agent) for agent in columns["agent"].tolist()])
         try:
             import pandas  # noqa: PLC0415 - no dependency
         except ImportError:
@@ -147,14 +151,16 @@ class Comparison:
     def show_recording(self, run: str = "") -> None:
         """Show a recording in the Rerun viewer: in the cell of a notebook, elsewhere in a window of its own.
 
-        ``run`` is a part of its path below :attr:`folder`, such as ``"dqn/seed_0"``; by default it is the last one.
+        ``run`` names whole parts of its path below :attr:`folder`, such as ``"dqn/seed_0"`` or ``"dqn"``. Of several
+        that fit the last one is shown.
 
         Raises:
             ArtefactError: There is no such recording.
             SetupError: There is no display, or the extra ``rerun``, or in a notebook ``notebook``, is not installed.
         """
         found = {path.relative_to(self.folder).as_posix(): path for path in sorted(self.folder.rglob("*.rrd"))}
-        fits = [name for name in found if run in name]
+        parts = f"/{run.strip('/')}/" if run else "/"
+        fits = [name for name in found if parts in f"/{name}/"]
         if not fits:
             raise ArtefactError(f"{self.folder} has no recording {run!r}; it has {', '.join(found) or 'none'}.")
         show = "show_in_notebook" if _NOTEBOOK in sys.modules else "open_in_viewer"
@@ -212,7 +218,7 @@ def bench(
     """
     registry.refuse_while_loading()
     task = _fitting("task", _plain(task), str)
-    root = expanded(Path(_fitting("out", _plain(out), str)))
+    root = expanded(Path(_fitting("out", _plain(out), str))).absolute()  # the process may go elsewhere afterwards
     processes = None if workers is None else _fitting("workers", _plain(workers), int)
     several: list[Any] = list(agents) if isinstance(agents, list | tuple | np.ndarray | Iterator) else [agents]
     if agents is not None and not all(isinstance(agent, str) or callable(agent) for agent in several):
@@ -374,7 +380,7 @@ def load(path: Path | str) -> Comparison:
     Raises:
         ArtefactError: There are no results in the folder, or a file is damaged.
     """
-    folder = expanded(Path(_fitting("path", _plain(path), str)))
+    folder = expanded(Path(_fitting("path", _plain(path), str))).absolute()
     places = [place for place in (folder, folder / "report") if place.is_dir()]
     for place in places:
         if (place / "protocol.json").exists() or (is_archive(place) and "variants" not in read_protocol_values(place)):
@@ -393,7 +399,8 @@ def load(path: Path | str) -> Comparison:
 
 
 def _of_bench(result: Result) -> Comparison:
-    return Comparison(result.folder, lambda: page_of(result))
+    edition: dict[str, object] = {"agent_names": result.protocol.agent_names}
+    return Comparison(result.folder, lambda: page_of(result), lambda agent: agent_label(agent, edition))
 
 
 def _page_of_judgement(folder: Path) -> Page:

@@ -10,6 +10,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import numpy as np
 
 from imagine_bench.arrays import Array, Arrays
+from imagine_bench.errors import InvalidValueError, brief
 
 Scalar = bool | int | float | str | None
 Setting = Scalar | tuple[Scalar, ...] | list[Scalar] | dict[str, Scalar]
@@ -112,3 +113,17 @@ def unpack(kind: Any, values: Any, arrays: Mapping[str, Array]) -> Any:
         each = [None] * len(parts) if values is None else values
         return origin(unpack(arguments[0], part, parts.get(str(index), {})) for index, part in enumerate(each))
     return values
+
+
+def numbers(diagnostics: Mapping[str, Any]) -> dict[str, float]:
+    """Diagnostics of a learner as tables hold them: true and false are 1 and 0, a tensor of one number is a number.
+
+    Raises InvalidValueError: one is no number.
+    """
+    found: dict[str, float] = {}
+    for name, value in diagnostics.items():
+        try:
+            found[name] = value if type(value) in (int, float) else float(value)
+        except (TypeError, ValueError):
+            raise InvalidValueError(f"The diagnostic {name!r} is {brief(value)}; give a number.") from None
+    return found

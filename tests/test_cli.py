@@ -191,6 +191,10 @@ def test_a_sweep_of_a_file_runs_what_is_wanted_and_reports(
     inline.jobs.clear()
     assert main([*suite, *"--experiment other --seeds 4 1".split()]) == 0
     assert inline.order == [("oracle", 1)], "the agent of the file; the run that there was is kept"
+    assert main([*suite, *"--experiment other --agents random --seeds 4 1".split()]) == 0
+    pages = [page.read_text() for page in (tmp_path / "runs" / "suite").glob("mine-*/report/scores.csv")]
+    assert len(pages) == 3 and len(set(pages)) == 3, "no report replaces that of other agents"
+    capsys.readouterr()
     assert main([*suite, *"--experiment other --agents failing --seeds 1".split()]) == 1
     assert capsys.readouterr().err.splitlines()[-1].endswith("1 runs failed; the same command tries them again.")
     inline.jobs.clear()

@@ -19,12 +19,13 @@ from typing import Any
 import cloudpickle
 import numpy as np
 import pytest
+import torch
 from imagine_bench.agents.baselines import RandomAgent
 from kept import RESULTS, table
 from small_runs import TWO_EPISODES
 
 import imagine_bench
-from imagine_bench import api, cli, registry
+from imagine_bench import api, cli, registry, values
 from imagine_bench.errors import (
     ArtefactError,
     ImagineBenchError,
@@ -234,6 +235,49 @@ def test_a_frame_is_the_table_of_the_report(results: api.Comparison, monkeypatch
     assert kind == "pandas" and list(columns)[:3] == ["agent", "seed", "episodes"]
 
 
+def test_diagnostics_of_any_kind_of_number_are_read_again_from_a_report(tmp_path: Path) -> None:
+    class Measured(Shifting):
+        def diagnostics(self) -> dict[str, Any]:
+            return {"done": True, "small": np.float32(0.5), "tensor": torch.tensor(2.0), "steps": 3}
+
+    imagine_bench.register_agent("inf", Measured)
+    page = imagine_bench.bench("arrow_puzzle", agents=["inf"], out=tmp_path, **TWO_EPISODES).report()
+    frame = imagine_bench.load(page.parent).frame()
+    assert set(frame["agent"]) == {"inf"}, "a name, and no number"
+    assert [float(frame[name][0]) for name in ("done", "small", "tensor", "steps")] == [1.0, 0.5, 2.0, 3.0]
+    with pytest.raises(InvalidValueError, match=r"diagnostic 'many' is array\(\[1, 2\]\); give a number"):
+        values.numbers({"many": np.array([1, 2])})
+
+
+@pytest.mark.parametrize(
+    ("asked", "shown"),
+    [("dqn/seed_1", "dqn/seed_1"), ("dqn", "dqn/seed_12"), ("seed_1", "sb3_dqn/seed_1"), ("", "sb3_dqn/seed_1")],
+)
+def test_a_recording_is_chosen_by_whole_parts_of_its_path(
+    asked: str, shown: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for run in ("dqn/seed_1", "dqn/seed_12", "sb3_dqn/seed_1"):
+        (tmp_path / run).mkdir(parents=True)
+        (tmp_path / run / "recording.rrd").touch()
+    opened: list[Path] = []
+    monkeypatch.setattr("imagine_bench.recording.stream.open_in_viewer", opened.append)
+    api.Comparison(tmp_path, None).show_recording(asked)
+    assert opened == [tmp_path / shown / "recording.rrd"]
+
+
+def test_results_stay_where_they_are_if_the_process_goes_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    made = imagine_bench.bench("arrow_puzzle", agents=["random"], out="runs", **TWO_EPISODES)
+    found = imagine_bench.load(made.folder.relative_to(tmp_path))
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    for results in (made, found):
+        assert results.report() == made.folder / "report/index.html"
+    assert made.folder.is_relative_to(tmp_path / "runs") and not list(Path.cwd().iterdir())
+
+
 def test_a_home_folder_is_meant_by_its_sign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where results are written, where they are read, and the file of an encoder."""
     monkeypatch.setenv("HOME", str(tmp_path))
@@ -272,7 +316,9 @@ def test_kept_results_are_loaded_as_they_were_written(kept: str) -> None:
     assert main in ("results", "scores")
     rows = table(f"{kept}/{main}.csv")
     assert set(frame) == set(rows[0]) and len(rows) > 5
-    for column in set(frame) - {"agent"}:  # labels that were renamed are today's
+    if "summary" in results.tables:
+        assert set(frame["agent"]) == set(results.frame("summary")["agent"]), "today's names"
+    for column in set(frame) - {"agent"}:
         for value, row in zip(frame[column], rows, strict=True):
             text = row[column]
             assert str(value) == text or float(text or "nan") == value or not text, (column, value, text)

@@ -88,15 +88,17 @@ class ImaginedVectorEnv(VectorEnv[Latents, Ints, NDArray[np.generic]]):
         """
         if len(self._z) == 0:
             raise InvalidValueError("No imagined episode has begun; call reset before step.")
-        if np.shape(actions) != (self.num_envs,) or not self.action_space.contains(np.asarray(actions, np.int64)):
+        given = np.asarray(actions)
+        if given.dtype.kind not in "iu" or not self.action_space.contains(given.astype(np.int64)):
+            count = self.imagination.model.n_actions
             raise InvalidValueError(
-                f"Actions {actions} must be {self.num_envs} in [0, {self.imagination.model.n_actions})."
+                f"Actions {brief(actions)}: give one integer in [0, {count}) for each of {self.num_envs} episodes."
             )
         generator = self._generator
         imagination = self.imagination
         generator.manual_seed(int(self.np_random.integers(2**63)))
         z = torch.tensor(self._z, device=generator.device)
-        action = torch.tensor(np.asarray(actions, np.int64), device=generator.device)
+        action = torch.tensor(given.astype(np.int64), device=generator.device)
         step = imagination.step(z, action, imagination.draw_weights(generator), generator)
         accepted = imagination.keeps(step, self._gathered).cpu().numpy()
         self._gathered = imagination.gathered_with(step, self._gathered)

@@ -323,7 +323,8 @@ class Sweep:
                 print(note)
         result = run_suite(suite, agents, root=self.launch.out, launcher=launcher)
         page = registry.load(_PAGES["suite"])(result)
-        write_report(page, self.launch.out / "suite" / f"{suite.name}-{suite.hash}" / "report")
+        name = f"{suite.name}-{suite.hash}-{digest(sorted(agents))[:6]}"  # the page of other agents stays
+        write_report(page, self.launch.out / "suite" / name / "report")
         if result.failures:
             raise RunFailedError(f"{len(result.failures)} runs failed; the same command tries them again.")
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import TypedDict
+
+import numpy as np
 
 from imagine_bench.arrays import Frame
 from imagine_bench.interfaces.capabilities import Imaginer
@@ -58,7 +61,10 @@ class BenchObserver(RunObserver):
             if self._questions is not None:
                 run.tell("imagining", at_once=True)
                 seeds = SeedTree(run.spec.seed).child("open_loop", budget)
-                found["open_loop"] = open_loop(run.agent, self._questions, seeds)
+                loop = open_loop(run.agent, self._questions, seeds)
+                if run.protocol.feedback:  # the agent imagines the teacher's rewards, not those of the rules
+                    loop = replace(loop, reward_mae=np.full_like(loop.reward_mae, math.nan))
+                found["open_loop"] = loop
         if run.entry.learns and can_be_asked(run.task):
             if self._frames is None:  # likewise
                 self._frames = frames_to_ask_with(run.agent, run.task, **_in_tests(run))

@@ -151,17 +151,20 @@ def read_dataset(folder: Path) -> Dataset:
     """Read a dataset, all that is in it but the files apart, and check it against its card if it has one.
 
     Raises:
-        ArtefactError: There is none, a file is damaged, or the content differs from the card.
+        ArtefactError: There is none, or several, a file is damaged, or the content differs from the card.
         SetupError: The library that its format needs is not installed.
     """
     card = read_card(folder)
     if card is not None and "control" in card:
         raise InvalidValueError(f"{folder} has hand commands, no macro-actions; give a dataset of these.")
-    found = next(((name, path) for mark, name in _MARKS.items() for path in sorted(folder.glob(mark))), None)
-    if found is None:
+    found = [(name, path) for mark, name in _MARKS.items() for path in sorted(folder.glob(mark))]
+    if not found:
         marks = ", ".join(f"{mark} ({name})" for mark, name in _MARKS.items())
         raise ArtefactError(f"{folder} is no dataset; give a folder with {marks}.")
-    format, path = found
+    if len(found) > 1:
+        places = ", ".join(str(path.relative_to(folder)) for _, path in found)
+        raise ArtefactError(f"{folder} holds {len(found)} datasets ({places}); give the folder of one.")
+    ((format, path),) = found
     episodes = registry.load(FORMATS[format]).read(path)
     if card is not None and card.get("content") != episodes.hash:
         raise ArtefactError(f"{folder} is damaged: its episodes are not those of its card. It was left untouched.")

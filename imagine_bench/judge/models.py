@@ -18,7 +18,7 @@ import numpy as np
 
 from imagine_bench import registry
 from imagine_bench.arrays import Arrays, Floats, Frame, Ints, State
-from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import AgentContext, TaskSpec
 from imagine_bench.interfaces.capabilities import Imaginer, begin_episode
 from imagine_bench.interfaces.episodes import Episodes
@@ -200,7 +200,7 @@ def source_of(
 
     Raises:
         UnknownNameError: No such model.
-        InvalidValueError: The agent of the run learned another task.
+        InvalidValueError: The agent of the run learned another task, or a teacher's feedback.
         ArtefactError: The run, or the encoder, cannot be read.
     """
     entry = model_entry(name)
@@ -214,6 +214,11 @@ def source_of(
         learned = kept.spec.protocol.task
         if registry.task(learned).id != spec.id:
             raise InvalidValueError(f"{name} learned {learned}, not {spec.id}; give a run of {spec.id}.")
+        if kept.spec.protocol.feedback:
+            raise InvalidValueError(
+                f"{name} learned rewards with a teacher's feedback in them, which the rules do not know; give a run "
+                "without --feedback."
+            )
         seen_through = kept.spec.encoder
         return ModelSource(name=name, make=entry.make, kept=kept, privileged=entry.privileged, encoder=seen_through)
     if entry.privileged:
@@ -308,11 +313,19 @@ def model_entry(model: str) -> WorldModelEntry:
 
     Raises:
         UnknownNameError: No such world model.
-        ArtefactError: This process does not know the agent.
+        ArtefactError: This process does not know the agent, or a path of no run.
     """
     runs = runs_of(model)
     if not runs:
-        return registry.world_model_entry(model)
+        try:
+            return registry.world_model_entry(model)
+        except UnknownNameError:
+            if len(Path(model).parts) == 1:
+                raise
+            raise ArtefactError(
+                f"There is no run of an agent in {model}, seen from {Path.cwd()}. A judgement of runs is read from the "
+                "folder in which it was made, while the runs are there."
+            ) from None
     seed, folder = next(iter(runs.items()))
     config = _config_of(folder)
     agent = agent_label(config["agent"], config["protocol"])

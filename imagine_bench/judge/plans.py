@@ -156,5 +156,7 @@ def _refusal(rollout: ImaginedRollout, max_epistemic: float | None) -> str:
     step = int(discarded.argmax())
     epistemic = f"{rollout.epistemic[step]:.2g}"
     if max_epistemic is None:
-        return f"the agent's filter discards macro-action {step + 1} (epistemic uncertainty of the state {epistemic})"
+        end = f"{rollout.p_terminated[step]:.2g}"  # the filter may read it, too
+        known = f"epistemic uncertainty of the state {epistemic}, probability of the end {end}"
+        return f"the agent's filter discards macro-action {step + 1} ({known})"
     return f"epistemic uncertainty {epistemic} at macro-action {step + 1} is above {max_epistemic:g}"

@@ -52,7 +52,7 @@ _OF_OLDER_RUNS = (
 )
 _SAME_TIME = 0.05
 """Share by which simulated times may differ: kinds of CPU differ by a step of physics."""
-_OF_DATASET = re.compile("-([0-9]+)@")
+_OF_DATASET = re.compile("-([0-9]+)@[0-9a-f]+$")
 """The number of its episodes in a dataset's identity."""
 _SEEDS_OF_COMMAND = re.compile(" bench .*--seeds[ =]([0-9]+(?:[ -][0-9]+)*)")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import ItemsView, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, cast
 
 from imagine_bench.appearance import appearance_name, appearance_typed
@@ -46,6 +47,7 @@ from imagine_bench.registry import (
 from imagine_bench.registry import task_name as canonical
 from imagine_bench.registry.by_value import CodeByValue
 from imagine_bench.registry.entries import parse_configuration
+from imagine_bench.rules import facts
 from imagine_bench.seeding import SeedTree
 from imagine_bench.values import Setting
 
@@ -285,8 +287,8 @@ def spec_of(name: str, split: str | None, *, testing: bool) -> TaskSpec:
     if split is None:
         return spec
     found = split_of(spec.rules, split)
-    rules = StartingFrom(spec.rules, found.test if testing else found.train)
-    return dataclasses.replace(spec, rules=cast("Rules", rules))
+    rules = cast("Rules", StartingFrom(spec.rules, found.test if testing else found.train))
+    return dataclasses.replace(spec, rules=rules, facts=partial(facts, rules, spec.horizon))
 
 
 PRESETS: dict[str, dict[str, Any]] = {

@@ -235,6 +235,10 @@ class Result(Interface):
     """The results of benches of every type: one run an agent and seed, in a folder."""
 
     @property
+    def protocol(self) -> ProtocolData:
+        """The comparison, as far as it is shown."""
+
+    @property
     def runs(self) -> Sequence[FinishedRun]:
         """One an agent and seed, each with its recording if it has one."""
 

@@ -28,7 +28,7 @@ from imagine_bench.interfaces.capabilities import (
 )
 from imagine_bench.interfaces.environments import Env
 from imagine_bench.judge.open_loop import Moment
-from imagine_bench.recording.filmstrips import DARK, filmstrip, sampled_filmstrips
+from imagine_bench.recording.filmstrips import DARK, filmstrip, sampled_filmstrips, signed
 from imagine_bench.recording.stream import KINDS, Recording, recording_file, scene_view, sheet_view
 from imagine_bench.rules import ending, is_random
 from imagine_bench.seeding import SeedTree, episode_seed
@@ -136,7 +136,7 @@ class _EpisodeRecorder:
             done = terminated or truncated
             step = step + 1
             fault = f" Fault: {info.get('fault_reason', 'not named')}." if info["fault"] else ""
-            outcome = f"Done: {names[action]}. Reward {float(reward):+.0f}.{fault}"
+            outcome = f"Done: {names[action]}. Reward {signed(float(reward))}.{fault}"
             heading = f"### Episode {episode}, after macro-action {step}\n\n{outcome}"
         end = ending(info, terminated=terminated)
         self._describe(heading, info, f"{end.capitalize()}.", observation.frame)

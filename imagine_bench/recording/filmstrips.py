@@ -108,7 +108,7 @@ def episode_strip(episode: RecordedEpisode, action_names: Sequence[str], columns
     tiles = [Tile(episode.frames[0], "start")]
     steps = zip(episode.frames[1:], episode.actions.tolist(), episode.rewards.tolist(), strict=True)
     for step, (frame, action, reward) in enumerate(steps, 1):
-        tiles.append(Tile(frame, f"{step}. {action_names[action]}", f"reward {reward:+.0f}"))
+        tiles.append(Tile(frame, f"{step}. {action_names[action]}", f"reward {signed(reward)}"))
     words = textwrap.fill(str(episode.end), _LETTERS)
     tiles[-1] = tiles[-1]._replace(below=f"{tiles[-1].below}\n{words}", right=bool(episode.success))
     rows = [tiles[first : first + columns] for first in range(0, len(tiles), columns)]
@@ -193,6 +193,11 @@ def transition_sheet(titles: Sequence[str], rows: Sequence[TileRow]) -> Pixels:
         marked = zip(images, above, rights, strict=True)
         drawn.append((name, [Tile(image, title, _verdict(right), right) for image, title, right in marked]))
     return sheet(drawn)
+
+
+def signed(reward: float) -> str:
+    """A reward with its sign and at most two decimals, those that are not 0: ``+50``, ``-0.5``, ``-1.23``."""
+    return f"{reward:+.2f}".rstrip("0").rstrip(".")
 
 
 def _verdict(right: bool | None) -> str:

@@ -35,7 +35,7 @@ from imagine_bench.store import run_folder
 from imagine_bench.store.bench_folder import BenchStore, bench_facts, read_protocol_as
 from imagine_bench.store.files import read_arrays, reading, table_rows, table_text, write_arrays, write_bytes
 from imagine_bench.store.results import AllRuns, OneRun
-from imagine_bench.values import grouped, pack
+from imagine_bench.values import grouped, numbers, pack
 
 LEVELS = (0.5, 0.8, 0.95)
 """Probabilities of the central intervals whose coverage is reported."""
@@ -216,7 +216,8 @@ def _learn(
         return regressor.predict(read_only(inputs), seeds.child("predict", variant, name).generator())
 
     begun_s = time.process_time()
-    shared: Row = {**regressor.train(on_epoch)}  # of all networks together; the CPU seconds are a network's share
+    # of all networks together; the CPU seconds are a network's share
+    shared: Row = {**numbers(regressor.train(on_epoch))}
     trained_s = time.process_time()
     tell("testing", f"{variant}, measuring", 0.9)
     tests = [task.testing(variant, node.child("test", variant).generator(), protocol.test_points) for node in networks]

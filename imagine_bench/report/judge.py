@@ -178,7 +178,11 @@ class Judged:
         """The data that models had learned from; nothing where all are trained agents, which learned in their
         benches.
         """
-        return f" after {self.judgement.sizes[-1]:,} transitions" if self.judgement.learning else ""
+        judgement = self.judgement
+        if not judgement.learning:
+            return ""
+        fitted = f" after {judgement.sizes[-1]:,} transitions"
+        return fitted + " (of trained agents, after their benches)" * (len(judgement.learning) < len(judgement.models))
 
 
 def judged(folder: Path, judgement: Judgement) -> Judged:

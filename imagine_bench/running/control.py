@@ -42,6 +42,7 @@ def plan_control(
             print(note)
     if found is not None:
         require_fits(found, registry.task(task), wanted.appearance)
+    _require_effect(wanted, wanted.demonstrations if found is None else len(found.episodes))
     if not registry.is_own(task):
         _require_sound(wanted)
     filled = {"settings_digest": digest(resolved_settings(wanted))}
@@ -57,6 +58,24 @@ def plan_control(
     if encoder or whole.dataset or whole.after or whole.demonstrations or whole.queries or rests_on_others:
         _check_abilities(whole, paths)
     return whole, paths
+
+
+def _require_effect(wanted: Protocol, watched: int) -> None:
+    """Raise InvalidValueError for two options of which one undoes the other; ``watched`` are the training episodes that
+    learners do not play themselves.
+    """
+    for option in ("dataset", "after"):
+        if wanted.split is not None and getattr(wanted, option):
+            raise InvalidValueError(
+                f"With --split no training episode begins where tests begin, but those of --{option} begin anywhere; "
+                "leave one of the two out."
+            )
+    for option in ("queries", "feedback"):
+        if watched >= wanted.budgets[-1] and getattr(wanted, option):
+            raise InvalidValueError(
+                f"Learners only watch all {wanted.budgets[-1]:,} training episodes, so --{option} changes nothing; "
+                "leave it out, or give a larger budget."
+            )
 
 
 def _require_sound(wanted: Protocol) -> None:

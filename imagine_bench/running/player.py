@@ -83,14 +83,9 @@ def protocol_of_player(
         raise InvalidValueError("There is nothing to play; give a task.")
     else:
         found = protocol(task, "quick", agents=(registry.DEMONSTRATOR,))
-    is_helped = found.dataset or found.after or found.demonstrations or found.queries or found.feedback
-    if not found.shows_frames_alone or (training is not None and (is_helped or found.split or found.test_appearance)):
-        raise InvalidValueError(
-            f"{like} shows more than frames, or trains otherwise than it tests; a player cannot be compared there."
-        )
     first = 0 if like is None else found.seeds[0]
     player = f"{'' if training is None else 'trained_'}{kind}:{name}"
-    return dataclasses.replace(
+    wanted = dataclasses.replace(
         found,
         execution=registry.task(found.task).execution(execution or found.execution),
         appearance=appearance or found.appearance,
@@ -105,6 +100,14 @@ def protocol_of_player(
         code=tuple(pair for pair in found.code if pair[0].startswith(TASK_CODE)),
         settings_digest=digest({} if training is None else {player: {}}),
     )
+    is_helped = found.dataset or found.after or found.demonstrations or found.queries or found.feedback
+    differs = is_helped or found.split or wanted.appearance_in_tests != wanted.appearance
+    if not found.shows_frames_alone or (training is not None and differs):
+        where = like or f"The appearance {wanted.appearance_in_words}"
+        raise InvalidValueError(
+            f"{where} shows more than frames, or trains otherwise than it tests; a player cannot be compared there."
+        )
+    return wanted
 
 
 class FinishedError(InvalidValueError):

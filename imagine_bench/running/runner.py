@@ -39,6 +39,7 @@ from imagine_bench.running.run_state import CountVisits, Run, environments, make
 from imagine_bench.seeding import episode_seed, evaluation_split
 from imagine_bench.store import run_folder
 from imagine_bench.store.results import Checkpoint, ComparedRollout, OpenLoop, PolicyTable, RecordedEpisode
+from imagine_bench.values import numbers
 
 
 class AtBudget(TypedDict, total=False):
@@ -253,7 +254,7 @@ def test(run: Run) -> EvaluationCounts:
             with run.training_time():
                 goes_on = run.agent.train_in_model()
             run.made_progress("training in the model")
-        counters.test = EvaluationCounts(diagnostics=run.agent.diagnostics())
+        counters.test = EvaluationCounts(diagnostics=numbers(run.agent.diagnostics()))
     purpose = evaluation_split(run.spec.seed)
     while counters.test.episodes < run.protocol.evaluation_episodes:
         start_s = time.process_time()

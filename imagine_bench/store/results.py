@@ -36,7 +36,7 @@ class OpenLoop:
     #: The same among those the uncertainty filter keeps (NaN where it keeps none).
     correct_accepted: Floats
     accepted: Floats  #: Share the filter keeps
-    reward_mae: Floats  #: Mean absolute error of the predicted reward
+    reward_mae: Floats  #: Mean absolute error of the predicted reward; NaN where a teacher's feedback was in it
     termination_error: Floats  #: Share with the wrong side of 0.5 for P(terminal)
     epistemic: Floats  #: Mean epistemic uncertainty
     aleatoric: Floats  #: Mean aleatoric uncertainty

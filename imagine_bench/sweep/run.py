@@ -155,7 +155,8 @@ class SuiteResult:
 def plan_level(suite: Suite, level: Level, agent: str) -> list[Planned]:
     """The benches of a level and an agent, one a seed; an agent that cannot transfer has no earlier task.
 
-    An encoder that does not exist yet is trained now. Raises as :func:`.bench.plan`.
+    A learner that cannot take an unannounced change is refused: without it the level would be another, and easier. An
+    encoder that does not exist yet is trained now. Raises as :func:`.bench.plan`.
     """
     fields: dict[str, Any] = {
         "agents": (agent,),
@@ -170,7 +171,7 @@ def plan_level(suite: Suite, level: Level, agent: str) -> list[Planned]:
     try:
         whole, encoders = plan(level.task, "quick", **fields)
     except UnableError:
-        if "after" not in fields:
+        if "after" not in fields or (fields.get("unannounced") and registry.agent_entry(agent).learns):
             raise
         alone = {name: value for name, value in fields.items() if name not in _EARLIER_TASKS}
         whole, encoders = plan(level.task, "quick", **alone)

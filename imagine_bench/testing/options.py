@@ -145,7 +145,9 @@ class CheckedOptions:
         self.run = functools.cache(self._run)
 
     def check(self, option: str) -> None:
-        """Raise InvalidValueError if the option changes nothing; NotOffered, with the sentence, if it is refused."""
+        """Raise InvalidValueError if the option changes nothing; NotOffered, with the sentence, if it is refused, or if
+        the task of another package is the same with it.
+        """
         row = OPTION_ROWS[option]
         try:
             changed = self.run(self._task_of(row), self._given(row), row.episodes)
@@ -153,6 +155,8 @@ class CheckedOptions:
         except ImagineBenchError as refusal:
             raise NotOffered(f"it is refused: {refusal}") from refusal
         effect = base != changed if row.shown else base.learned != changed.learned
+        if not effect and row.shown and not registry.is_own(self.task):  # no fault of the agent's
+            raise NotOffered(f"with it task {self.task} shows nothing else")
         require(effect, f"{option} changes nothing that {self.agent} does, earns or learns")
 
     def _without(self, row: OptionRow) -> _Left:

@@ -15,9 +15,10 @@ from forger import FORGERIES, IN_TRAINING, forged, share_weights
 from forging import OpenRun, of_second, oracle, rewrite_protocol
 from guest_packages import Guests
 from kinds import take_row
-from small_runs import Inline, small, written
+from small_runs import Inline, collected, small
 
 from imagine_bench import registry
+from imagine_bench.data.folder import write_dataset
 from imagine_bench.errors import ArtefactError, SetupError, UnknownNameError
 from imagine_bench.interfaces.environments import Wrapper
 from imagine_bench.judge.verify import Replays, has_own_failures, verdicts
@@ -324,7 +325,10 @@ def test_two_seeds_may_learn_the_same_from_a_dataset_alone(tmp_path: Path, episo
     """Episodes are numbered from the first of the dataset, which are not played again."""
     few = {"agents": ("table",), "seeds": (0, 1), "budgets": (episodes,), "evaluation_episodes": 4}
     how = {"execution": "kinematic", "appearance": "mild", "open_loop_starts": 0, "recorded_episodes": 0}
-    wanted, paths = plan_control("arrow_puzzle", "smoke", **few, **how, dataset=written(tmp_path / "set").folder)
+    played, apart, card = collected()
+    card["policy"] = "program:laws-2@0123456789ab"  # of a file whose name ends like the number of a dataset's episodes
+    dataset = write_dataset(tmp_path / "set", played, apart, card, "npz").folder
+    wanted, paths = plan_control("arrow_puzzle", "smoke", **few, **how, dataset=dataset)
     folder = bench(wanted, paths, root=tmp_path, launcher=Inline()).folder
     counts = EvaluationCounts()
     first, *others = (episode_seed("evaluation", 0, test) for test in range(4))

@@ -7,9 +7,10 @@ from collections.abc import Iterable
 
 import imagine_bench.agents.dqn  # noqa: F401 - loads torch, which no test's time holds
 import pytest
+from guest_packages import Guests
 
 from imagine_bench import registry
-from imagine_bench.registry.builtin import guests
+from imagine_bench.registry.builtin import guests as guests_of_ours
 from imagine_bench.testing.checks import NotOffered, checked_agent
 from imagine_bench.testing.options import OPTION_ROWS, CheckedOptions, require_every_field, watching_teaches_as_living
 
@@ -18,7 +19,7 @@ _HEAVY = ("dqn_", "dreamer_", "drqn", "imagination_exact", "lewm", "sb3_")
 """Guests that train networks or load a library for longer than a fast test may last; those with tables are fast."""
 _DO_LESS = ("imagination", "imagination_only", "dqn_more_updates")
 """Agents that do as much as another of the same class or less, which the fast tests check."""
-_GUESTS = {name for guest in guests() for name in guest.names.get(registry.AGENT_GROUP, ())}
+_GUESTS = {name for guest in guests_of_ours() for name in guest.names.get(registry.AGENT_GROUP, ())}
 AGENTS = [
     *(
         pytest.param(name, marks=[pytest.mark.slow] * (name in _DO_LESS))
@@ -93,3 +94,12 @@ def test_watching_episodes_teaches_as_living_them(agent: str) -> None:
         watching_teaches_as_living(checked_agent(agent, TASK))
     except NotOffered:
         assert not entry.learns or entry.external_training_loop, "only those learn from no episodes that are shown"
+
+
+def test_a_task_that_always_looks_the_same_is_no_fault_of_an_agent(guests: Guests) -> None:
+    guests.new("task", "their_task")
+    guests.new("agent", "their_agent")
+    checked = CheckedOptions("their_agent", "their_task")
+    checked.check("split")
+    with pytest.raises(NotOffered, match="with it task their_task shows nothing else"):
+        checked.check("appearance")

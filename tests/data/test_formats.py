@@ -115,6 +115,15 @@ def test_a_set_of_others_is_read_without_a_card(tmp_path: Path, monkeypatch: pyt
 # --- LeRobot ---------------------------------------------------------------------------------------------------------
 
 
+def test_a_folder_of_several_sets_is_not_read_as_one(tmp_path: Path) -> None:
+    for name in ("one", "other"):
+        (made,) = written(tmp_path / name, "minari", episodes=1).folder.glob("*/data")
+        shutil.copytree(made, tmp_path / "sets" / name / "data")
+    with pytest.raises(ArtefactError, match=r"2 datasets \(one/data/metadata.json, other/data/metadata.json\)"):
+        read_dataset(tmp_path / "sets")
+    assert len(read_dataset(tmp_path / "sets" / "one").episodes) == 1
+
+
 def test_the_layout_is_lerobots(tmp_path: Path) -> None:
     """The needs of LeRobot's own reader; those of 0.4.4 and 0.6.1 were run on such a set, but install only apart.
 

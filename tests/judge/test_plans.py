@@ -195,7 +195,7 @@ def test_the_recording_shows_the_same_plans_and_the_arm_moves(
     ("dreams", "bound", "words"),
     [
         ({"uncertainty": 0.9}, 0.3, "is above 0.3"),
-        ({"accepts": False}, None, "the agent's filter discards macro-action 1"),
+        ({"accepts": False}, None, "discards macro-action 1 (epistemic uncertainty of the state 0, probability of"),
         ({"accepts": False, "uncertainty": 0.9}, 1.0, ""),  # the bound replaces the agent's own filter
         ({"uncertainty": 0.9}, 0.0, "is above 0"),
         ({"accepts": False, "uncertainty": 0.0}, 0.0, ""),

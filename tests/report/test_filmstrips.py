@@ -136,6 +136,18 @@ def test_an_episode_s_strip_shows_every_frame_and_the_end(length: int) -> None:
     assert places == sorted(places) and strip.shape[1] < 700, "in order, and it fits a page"
 
 
+def test_the_rewards_of_an_episode_are_shown_with_their_fractions() -> None:
+    """As they are where chance changes rewards."""
+    assert [filmstrips.signed(reward) for reward in (-1.5, -0.5, 50.0, 0.0, -1.234)] == [
+        *("-1.5", "-0.5", "+50", "+0", "-1.23")
+    ]
+    strips = []
+    for reward in (-1.5, -2.0):
+        episode = dataclasses.replace(recorded(1, success=False), rewards=np.array([reward]))
+        strips.append(filmstrips.episode_strip(episode, PICK_PLACE.action_names))
+    assert (strips[0] != strips[1]).any()
+
+
 def numbered(actions: list[int]) -> list[Tile]:
     """The words above the images of an episode."""
     words = [f"{step}. {PICK_PLACE.action_names[action]}" for step, action in enumerate(actions, 1)]

@@ -140,6 +140,25 @@ def test_what_cannot_be_learned_from_is_refused(tmp_path: Path, task: str, chang
         plan(task, "smoke", dataset=written(tmp_path / "set").folder, **{**_FEW, **changes})
 
 
+@pytest.mark.parametrize("help_given", ["after", "dataset"])
+def test_a_split_keeps_the_starts_of_tests_out_of_all_training(tmp_path: Path, help_given: str) -> None:
+    value = written(tmp_path / "set").folder if help_given == "dataset" else ("arrow_puzzle_toward",)
+    with pytest.raises(InvalidValueError, match=f"those of --{help_given} begin anywhere; leave one of the two out"):
+        plan_control("arrow_puzzle", "smoke", agents=("pupil",), split="values=3:2", **{**_FEW, help_given: value})
+
+
+@pytest.mark.parametrize("option", ["feedback", "queries"])
+def test_a_learner_that_only_watches_is_taught_nothing_more(tmp_path: Path, option: str) -> None:
+    taught: dict[str, Any] = {option: 1, "agents": ("factored:given",), **_FEW, "appearance": "clean"}
+    with pytest.raises(InvalidValueError, match=f"watch all 6 training episodes, so --{option} changes nothing"):
+        plan_control("arrow_puzzle", "smoke", demonstrations=9, budgets=(6,), **taught)
+    watched = written(tmp_path / "set").folder
+    with pytest.raises(InvalidValueError, match=f"watch all 6 training episodes, so --{option} changes nothing"):
+        plan_control("arrow_puzzle", "smoke", dataset=watched, **{**taught, "appearance": "mild"})
+    wanted, _ = plan_control("arrow_puzzle", "smoke", demonstrations=5, budgets=(6,), **taught)
+    assert wanted.demonstrations == 5
+
+
 def test_tests_may_look_otherwise_than_a_dataset(tmp_path: Path) -> None:
     wanted = spec_of(written(tmp_path / "set").folder, test_appearance="clean").protocol
     assert (wanted.appearance, wanted.test_appearance) == ("mild", "clean")

@@ -14,6 +14,7 @@ from small_runs import Inline, do, measured
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import BusyError, ImagineBenchError, InvalidValueError
+from imagine_bench.exact.certificate import certificate
 from imagine_bench.judge.verify import verify_runs
 from imagine_bench.protocols.control import Protocol, protocol
 from imagine_bench.running.bench import bench
@@ -21,6 +22,7 @@ from imagine_bench.running.player import FinishedError, PlayedRun, played_run, p
 from imagine_bench.store import run_folder
 from imagine_bench.store.files import write_json
 from imagine_bench.store.loading import load_so_far, merge
+from imagine_bench.tools import play
 from imagine_bench.tools.audits import why_report
 
 SPEC = registry.task("arrow_puzzle")
@@ -167,6 +169,23 @@ def test_an_appearance_that_is_asked_for_is_that_of_the_tests(tmp_path: Path) ->
     for asked, found in ((None, "strong"), ("mild", "mild")):
         wanted = protocol_of_player(None, "person", "anna", like=tmp_path, appearance=asked)
         assert wanted.appearance_in_tests == found
+
+
+def test_no_player_trains_on_the_fragments_of_its_tests() -> None:
+    assert wanted(appearance="patched").appearance_in_tests == "photo_held_out"
+    with pytest.raises(InvalidValueError, match=r"The appearance patched .* trains otherwise than it tests"):
+        wanted(appearance="patched", training=1)
+
+
+def test_a_person_is_told_the_chance_of_the_starts_of_the_tests(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there = protocol("arrow_puzzle", "smoke", agents=("random",), split="plan_length=2", execution="kinematic")
+    write_json(tmp_path / "protocol.json", there.as_dict())
+    monkeypatch.setattr(play, "keyboard_player", lambda: lambda game, **options: None)
+    said = play.keep_playing(protocol_of_player(None, "person", "anna", like=tmp_path), tmp_path / "runs")
+    chance = certificate(there.spec(testing=True)).chance_level
+    assert f"chance {chance:.1%}, optimum 100.0%" in said and f"{SPEC.facts().chance_level:.1%}" not in said
 
 
 def test_nothing_of_the_learners_of_a_bench_is_said_of_a_player(tmp_path: Path) -> None:

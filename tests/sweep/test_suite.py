@@ -15,7 +15,7 @@ from small_runs import Inline
 from whole_outputs import masked
 
 from imagine_bench import registry
-from imagine_bench.errors import ImagineBenchError, InvalidValueError
+from imagine_bench.errors import ImagineBenchError, InvalidValueError, UnableError
 from imagine_bench.exact.splits import split_of
 from imagine_bench.report.page import texts
 from imagine_bench.report.sweep import levels_csv, scores_csv, suite_page
@@ -199,11 +199,17 @@ def test_separating_names_its_agents_and_hides_the_changed_rule():
     assert separating.agents != GRIDS[SUITE].agents and {"dqn", "lewm", "laws:given"} < set(separating.agents)
     assert dataclasses.replace(separating, agents=("dqn",)).hash == separating.hash
     by_name = {each.name: each.levels for each in separating.experiments}
-    for level in (level for levels in by_name.values() for level in levels):
+    for level in (level for name, levels in by_name.items() for level in levels if name != "changed_rule"):
         (planned, _), *others = plan_level(separating, level, "sb3_dqn")
         assert len(others) == 2 and planned.seeds == (400,) and planned.budgets[-1] == level.episodes
     told = [plan_level(separating, by_name["changed_rule"][0], agent)[0][0] for agent in ("dqn", "random")]
     assert [(each.after, each.unannounced) for each in told] == [(("arrow_puzzle",), True), ((), False)]
+
+
+def test_no_learner_is_scored_without_the_unannounced_change():
+    changed = {each.name: each.levels for each in GRIDS["separating"].experiments}["changed_rule"][0]
+    with pytest.raises(UnableError, match=r"'sb3_dqn' .*, or that agent"):
+        plan_level(GRIDS["separating"], changed, "sb3_dqn")
 
 
 def test_who_cannot_carry_over_starts_anew():

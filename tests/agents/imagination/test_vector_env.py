@@ -15,7 +15,7 @@ from counting_model import RuledModel, ruled
 from fake_latents import CODES, built, frame, live
 from imagine_bench.agents.imagination import agent as imagination_agents
 from imagine_bench.agents.imagination.agent import ImaginingAgent
-from imagine_bench.agents.imagination.vector_env import ImaginedVectorEnv, imagined_env
+from imagine_bench.agents.imagination.vector_env import ImaginedEnv, ImaginedVectorEnv, imagined_env
 from same_values import assert_same
 
 from imagine_bench import registry
@@ -126,6 +126,8 @@ def test_a_learned_world_is_the_same_by_seed_and_a_copy_goes_on_alike(trained: I
 def test_bad_input_is_refused() -> None:
     still = np.zeros(4, np.int64)
     env = puzzle()
+    one = ImaginedEnv(puzzle(num_envs=1))
+    one.reset(seed=0)
     wrong: dict[str, Callable[[], object]] = {
         r"shape \(P, 15\)": lambda: ImaginedVectorEnv(ruled(TASK), np.zeros((3, 4), np.float32)),
         "num_envs is 0; give an integer from 1 on": lambda: puzzle(num_envs=0),
@@ -133,7 +135,10 @@ def test_bad_input_is_refused() -> None:
         "seed is -1; give an integer from 0 on": lambda: env.reset(seed=-1),
         "imagined episodes take none": lambda: env.reset(options={"macrostate": (0, 1, 2, 0)}),
         "call reset before step": lambda: env.step(still),
-        r"Actions \[6 6 6 6\] must be 4 in \[0, 6\)": lambda: (env.reset(seed=0), env.step(still + 6)),
+        r"6\]\): give one integer in \[0, 6\) for each of 4": lambda: (env.reset(seed=0), env.step(still + 6)),
+        r"\[0, 1.7, 0, 0\]: give one integer": lambda: env.step([0, 1.7, 0, 0]),  # type: ignore[arg-type]
+        "nan.*: give one integer": lambda: env.step(np.full(4, np.nan)),  # type: ignore[arg-type]
+        "True.*: give one integer": lambda: one.step(True),  # type: ignore[arg-type]
     }
     for words, do in wrong.items():
         with pytest.raises(InvalidValueError, match=words):

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from small_runs import Inline, do, small
 
@@ -19,7 +20,7 @@ from imagine_bench.judge.judgement import Judgement, judge, kept, shown
 from imagine_bench.judge.models import ModelSource, model_entry, opened, source_of
 from imagine_bench.judge.reading import RenderedFrameIndex
 from imagine_bench.protocols.control import protocol
-from imagine_bench.report.judge import judged, judgement_page
+from imagine_bench.report.judge import Judged, judged, judgement_page
 from imagine_bench.running import bench as benches
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders, run_folder
@@ -78,6 +79,17 @@ def test_the_folder_of_an_agent_stands_for_all_its_runs(runs: dict[str, Path], t
     assert list(shown(folder, one)) == [agent]
 
 
+def test_a_verdict_says_what_each_model_had_learned_from(runs: dict[str, Path], tmp_path: Path) -> None:
+    """A trained agent learned in its bench, and not from the data of the others."""
+    run, spec = str(runs["imaginer"]), registry.task("arrow_puzzle")
+    said = {
+        models: Judged(tmp_path, Judgement(task=spec.id, models=models, sizes=(20, 40)), spec, {}).after
+        for models in (("copy",), (run,), (run, "copy"))
+    }
+    fitted = " after 40 transitions"
+    assert list(said.values()) == [fitted, "", f"{fitted} (of trained agents, after their benches)"]
+
+
 @pytest.mark.usefixtures("_few")
 def test_a_run_that_was_made_anew_is_judged_anew(tmp_path: Path) -> None:
     wanted = small(budgets=(2,), agents=("imaginer",))
@@ -126,6 +138,8 @@ def test_runs_that_cannot_be_judged_say_why(runs: dict[str, Path], tmp_path: Pat
         visited("table", "arrow_puzzle")
     with pytest.raises(InvalidValueError, match="learned arrow_puzzle, not pick_place"):
         visited("imaginer", "pick_place")
+    with pytest.raises(ArtefactError, match="no run of an agent in runs/elsewhere/seed_0, seen from"):
+        model_entry("runs/elsewhere/seed_0")
     found = visited("imaginer", "arrow_puzzle")
     assert found and len(found) <= 2 * 20, "its experience is the one that the bench counted"
     assert all(len(state) == 4 and 0 <= action < 6 for state, action in found)
@@ -149,6 +163,16 @@ def test_the_experience_of_a_run_is_not_known_where_others_were_learned_from(tmp
     source = dataclasses.replace(_source(str(run.folder), "arrow_puzzle"), privileged=True)
     with opened(source, "arrow_puzzle", folder=tmp_path, log=tmp_path / "log") as judged:
         assert judged.visited is None and not judged.learns
+
+
+def test_rewards_with_feedback_in_them_are_not_compared_with_the_rules(tmp_path: Path) -> None:
+    options = {"agents": ("imaginer",), "budgets": (2,), "open_loop_starts": 2}
+    plain = do(tmp_path / "plain", "imaginer", **options)
+    taught = do(tmp_path / "taught", "imaginer", feedback=5.0, **options)
+    errors = [run.checkpoints[0].open_loop.reward_mae for run in (plain, taught)]  # type: ignore[union-attr]
+    assert np.isfinite(errors[0]).all() and np.isnan(errors[1]).all()
+    with pytest.raises(InvalidValueError, match="a teacher's feedback in them"):
+        _source(str(taught.folder), "arrow_puzzle")
 
 
 _TWICE = ("mdn_thesis:model.members=2,model.dropout=0.1", "copy", "mdn_thesis:model.dropout=0.1,model.members=2")

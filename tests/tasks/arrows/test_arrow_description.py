@@ -13,7 +13,7 @@ from imagine_bench.tasks.parameters.parameters import GESTURES
 from whole_outputs import KEPT
 
 from imagine_bench import registry
-from imagine_bench.errors import ImagineBenchError, InvalidValueError
+from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError
 from imagine_bench.protocols.control import protocol
 from imagine_bench.registry.entries import file_name, parse_options
 
@@ -83,6 +83,9 @@ def test_a_world_may_lie_in_a_file(tmp_path):
         file.write_text(content)
         with pytest.raises(ImagineBenchError):
             registry.task(f"arrows:@{file}")
+    file.write_text('{"slip": 0.1, "cubes": 4, "slip": 0.3}')
+    with pytest.raises(ArtefactError, match="one of slip, cubes, slip is given twice"):
+        registry.task(f"arrows:@{file}")
 
 
 def test_a_world_ends_at_its_own_horizon():

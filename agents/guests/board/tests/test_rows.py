@@ -23,7 +23,10 @@ from whole_outputs import expected_of
 
 from imagine_bench.cli import exit_code
 from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.exact.certificate import certificate
+from imagine_bench.report.page import percent
 from imagine_bench.running.bench import bench
+from imagine_bench.seeding import TUNING_SEEDS
 from imagine_bench.store.bench_folder import bench_facts
 from imagine_bench.store.run_folder import load_run
 
@@ -99,6 +102,25 @@ def test_rows_of_unlike_tests_stand_in_tables_of_their_own() -> None:
     others = [dataclasses.replace(one, **{name: value}) for name, value in unlike.items()]
     assert len({world_words(each) for each in (one, *others)}) == 1 + len(others)
     assert world_words(dataclasses.replace(one, seeds=(5,), budgets=(3,))) == world_words(one)
+
+
+def test_the_tests_of_tuning_seeds_are_told_from_those_of_others(tmp_path: Path) -> None:
+    for seed in (3, TUNING_SEEDS + 3):
+        wanted = small(agents=("random",), seeds=(seed,), evaluation_episodes=2)
+        folder = bench(wanted, {}, root=tmp_path, launcher=Inline()).folder
+        submit(folder, tmp_path / "rows", author="", round_folder=None, encoder=None)
+    found = {each.row.protocol.seeds[0]: each.row.starts for each in check(tmp_path) if each.row is not None}
+    assert found == {3: "open starts", TUNING_SEEDS + 3: "tuning starts"}
+
+
+def test_the_chance_beside_a_split_is_that_of_its_tests(tmp_path: Path) -> None:
+    wanted = small(split="plan_length=2", agents=("random",), evaluation_episodes=2)
+    folder = bench(wanted, {}, root=tmp_path, launcher=Inline()).folder
+    submit(folder, tmp_path / "rows", author="", round_folder=None, encoder=None)
+    page = write_board(check(tmp_path), tmp_path / "page").read_text()
+    exact = certificate(wanted.spec(testing=True)).chance_level
+    assert f"Chance solves {percent(exact)} % of its episodes" in in_words(page)
+    assert percent(exact) != percent(wanted.spec(testing=False).facts().chance_level)
 
 
 def test_a_long_command_is_cut(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -104,6 +104,14 @@ def test_babbling_is_what_was_reached_and_the_joints_with_noise() -> None:
     assert (data.targets - commanded).std() == pytest.approx(0.01, rel=0.1), "radians"
 
 
+def test_a_number_of_samples_has_one_spelling() -> None:
+    """So no bench compares a variant with itself."""
+    assert ik.samples_of("50") == 50
+    for other in ("050", "٥٠", "50.0", "+50"):
+        with pytest.raises(InvalidValueError, match=re.escape(f"such as 2000, not {other!r}")):
+            ik.samples_of(other)
+
+
 def test_decisions_are_carried_out_by_the_arm(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of networks with any output: the arm rests where equation 4.29 puts the joints, and misses by that."""
 

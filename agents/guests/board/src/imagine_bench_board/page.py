@@ -135,7 +135,7 @@ def _section(world: str, rows: Sequence[Row]) -> Section:
     cells = [_cells(row) for row in best_first]
     if not any(row.claimed.agent.startswith(_PERSON) for row in rows):
         cells.append({**dict.fromkeys(cells[0], DASH), "player (claimed)": f"{_PERSON}: {_NOBODY}"})
-    facts = registry.task(rows[0].protocol.task).facts()
+    facts = rows[0].protocol.spec(testing=True).facts()
     words = [
         f"Chance solves {percent(facts.chance_level)} % of its episodes and an optimal player who sees all "
         f"{percent(facts.optimum)} %. Solved, return and tests follow from the episodes that a number leads to. The "

@@ -23,6 +23,7 @@ from imagine_bench.interfaces import TaskSpec
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import require_types
 from imagine_bench.running.evaluation import EpisodeLog
+from imagine_bench.seeding import is_tuning_seed
 from imagine_bench.store.files import make_folder, read_json, reading, write_bytes, write_json
 from imagine_bench.store.results import Checkpoint, KeptEpisodes
 from imagine_bench.values import Json, unpack
@@ -34,6 +35,8 @@ CARD = "card.json"
 EPISODES = "episodes.json"
 OPEN = "open starts"
 """Of tests whose starts everybody could know while training."""
+TUNING = "tuning starts"
+"""Of the tests of tuning seeds: others than those of reported seeds, and known to whoever chose settings by them."""
 ROWS = "rows"
 """The folder of a board that holds its rows."""
 LARGEST = {CARD: 1 << 18, EPISODES: 1 << 24}
@@ -134,7 +137,8 @@ class Row:
     @property
     def starts(self) -> str:
         """The kind of starts of its tests."""
-        return starts_words(self.round)
+        is_tuning = not self.round and is_tuning_seed(self.protocol.seeds[0])
+        return TUNING if is_tuning else starts_words(self.round)
 
     @property
     def agents(self) -> dict[str, str]:

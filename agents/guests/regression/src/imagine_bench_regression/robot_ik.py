@@ -78,7 +78,8 @@ def samples_of(variant: str) -> int:
     Raises:
         InvalidValueError: It is not a whole number in the allowed range.
     """
-    if not variant.isdecimal() or not MIN_SAMPLES <= int(variant) <= MAX_SAMPLES:
+    written = variant.isdecimal() and str(int(variant)) == variant  # each number in one way: 50, not 050
+    if not written or not MIN_SAMPLES <= int(variant) <= MAX_SAMPLES:
         raise InvalidValueError(
             f"A variant of robot_ik is a number of samples in [{MIN_SAMPLES}, {MAX_SAMPLES}], such as 2000, "
             f"not {variant!r}."
