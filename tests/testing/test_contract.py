@@ -145,6 +145,35 @@ class _Counting(_Sound):
         return super().act(observation, explore=explore)
 
 
+class _CountsInValues(_Sound):
+    """Keeps a number among the JSON values, not the arrays, and counts in it how often it is asked."""
+
+    asked = 0
+
+    def act(self, observation: Any, *, explore: bool) -> int:
+        self.asked += 1
+        return super().act(observation, explore=explore)
+
+    def state(self) -> AgentState:
+        state = super().state()
+        return AgentState(arrays=state.arrays, values={**state.values, "asked": self.asked})
+
+
+class _SharesValues(_Sound):
+    """A list that grows as it learns, and that the state does not copy."""
+
+    def __init__(self, context: AgentContext) -> None:
+        super().__init__(context)
+        self.rewards: list[float] = []
+
+    def observe(self, transition: Any, *, episode: int) -> None:
+        self.rewards.append(transition.reward)
+
+    def state(self) -> AgentState:
+        state = super().state()
+        return AgentState(arrays=state.arrays, values={**state.values, "rewards": self.rewards})
+
+
 class _Wordy(_Sound):
     def diagnostics(self) -> Any:
         return {"loss": "small"}
@@ -177,6 +206,8 @@ def _none(context: AgentContext) -> None:
         (_none, "it is made: Agent dqn has no method act"),
         (_Wild, "greedily without a change: Action 6 does not exist"),
         (_Counting, "acting with explore=False changes its state"),
+        (_CountsInValues, "acting with explore=False changes its state"),
+        (_SharesValues, "later learning alters a state that it gave before"),
         (_Wordy, "diagnostics: no numbers"),
         (_Sharing, "later learning alters a state that it gave before"),
         (_Uncertain, "it goes on to the same bits: it acts otherwise"),
