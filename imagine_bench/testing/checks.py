@@ -77,6 +77,8 @@ def _frames(spec: TaskSpec) -> None:
 def _gymnasium(spec: TaskSpec) -> None:
     with closing(make_env(spec)) as env:
         check_env(env.unwrapped, skip_render_check=True)
+        asked = gymnasium.spaces.Discrete(spec.n_actions)
+        require(env.action_space == asked, f"its action_space is {env.action_space}, the rules say {asked}")
 
 
 def _starts(spec: TaskSpec) -> None:

@@ -48,6 +48,12 @@ class _Forgetful(gymnasium.Wrapper[Any, Any, Any, Any]):
         return frame ^ self.noise.integers(2, size=frame.shape, dtype=np.uint8), info
 
 
+class _OneMore(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Has an action that the rules do not know."""
+
+    action_space = gymnasium.spaces.Discrete(7)
+
+
 def _without_options(agent: str) -> Checks:
     """Checks of an agent without those of protocol options, which tests/contract/test_options.py carries out."""
     return {what: check for what, check in checks(agent=agent).items() if not what.startswith("the option")}
@@ -78,6 +84,8 @@ def test_wrong_tasks_are_found(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     monkeypatch.setattr(MacroEnv, "set_state", lambda self, state: None)
     assert "put back in the same environment, it goes on otherwise" in check("middle of an episode")
     made = gymnasium.make
+    monkeypatch.setattr(gymnasium, "make", lambda *given, **named: _OneMore(made(*given, **named)))
+    assert "its action_space is Discrete(7), the rules say Discrete(6)" in check("Gymnasium's checker")
     monkeypatch.setattr(gymnasium, "make", lambda *given, **named: _Forgetful(made(*given, **named)))
     assert "every macrostate is begun in, and told: begun in" in check("is begun in")
     assert "two episodes of seed 0 differ" in check("same seed")
