@@ -83,8 +83,7 @@ def protocol_of_player(
         raise InvalidValueError("There is nothing to play; give a task.")
     else:
         found = protocol(task, "quick", agents=(registry.DEMONSTRATOR,))
-    is_helped = found.dataset or found.after or found.demonstrations or found.queries or found.feedback
-    if not found.shows_frames_alone or (training is not None and (is_helped or found.split or found.test_appearance)):
+    if not found.shows_frames_alone or (training is not None and (found.helps or found.split or found.test_appearance)):
         raise InvalidValueError(
             f"{like} shows more than frames, or trains otherwise than it tests; a player cannot be compared there."
         )
