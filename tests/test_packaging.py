@@ -73,7 +73,7 @@ def test_the_wheel_holds_every_module_and_resource(wheel: list[str]) -> None:
                 inside = path.relative_to(_TOP / room)
                 name = f"imagine_bench/{inside}" if room == "imagine_bench" else f"imagine_bench/assets/{inside}"
                 missing += [name] if name not in wheel else []
-    assert missing == []
+    assert missing == [], "name a new folder in packages of pyproject.toml"
     assert any(name.endswith(".safetensors") for name in wheel)  # non-vacuous
 
 

@@ -187,6 +187,12 @@ class BudgetSection:
                 raise InvalidValueError(f"{name} is {getattr(self, name)}, but no task comes before; give it in after.")
 
     @property
+    def helps(self) -> tuple[str, ...]:
+        """The options of training that are in use: the fields of this section that are not as by default."""
+        options = [each for each in dataclasses.fields(BudgetSection) if each.name != "budgets"]
+        return tuple(each.name for each in options if getattr(self, each.name) != each.default)
+
+    @property
     def episodes_before(self) -> int:
         """Real training episodes on earlier tasks."""
         return len(self.after) * self.after_episodes
@@ -436,12 +442,11 @@ def _require_learner(wanted: Protocol) -> None:
     """Raise UnableError for an option of training where no agent of the bench learns."""
     if any(agent_entry(agent).learns for agent in wanted.agents):
         return
-    for option in ("dataset", "demonstrations", "queries", "feedback", "after"):
-        if getattr(wanted, option):
-            raise UnableError(
-                f"No agent of this bench learns ({', '.join(wanted.agents)}), so --{option} changes nothing; leave it "
-                "out, or give an agent that learns."
-            )
+    for option in wanted.helps:
+        raise UnableError(
+            f"No agent of this bench learns ({', '.join(wanted.agents)}), so --{option.replace('_', '-')} changes "
+            "nothing; leave it out, or give an agent that learns."
+        )
 
 
 def _require_takes(agent: str, wanted: Protocol) -> None:

@@ -112,9 +112,8 @@ def _refuse_unable(wanted: Protocol) -> None:
 
     The learner is made with a bundled encoder of the same kind in place of its own.
     """
-    asks = wanted.dataset or wanted.after or wanted.demonstrations or wanted.queries or wanted.feedback
     entries = {agent: registry.agent_entry(agent) for agent in wanted.agents}
-    if not asks or not any(entry.needs_encoder for entry in entries.values()):
+    if not wanted.helps or not any(entry.needs_encoder for entry in entries.values()):
         return
     for agent, entry in entries.items():
         stand_in = next(path for path in encoders.bundled().values() if encoders.kind(path) == entry.encoder_kind)

@@ -100,8 +100,7 @@ def protocol_of_player(
         code=tuple(pair for pair in found.code if pair[0].startswith(TASK_CODE)),
         settings_digest=digest({} if training is None else {player: {}}),
     )
-    is_helped = found.dataset or found.after or found.demonstrations or found.queries or found.feedback
-    differs = is_helped or found.split or wanted.appearance_in_tests != wanted.appearance
+    differs = found.helps or found.split or wanted.appearance_in_tests != wanted.appearance
     if not found.shows_frames_alone or (training is not None and differs):
         where = like or f"The appearance {wanted.appearance_in_words}"
         raise InvalidValueError(

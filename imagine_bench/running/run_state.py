@@ -159,18 +159,17 @@ def require_able(agent: object, name: str, protocol: Protocol) -> None:
     privileged = registry.agent_entry(name).privileged
     own_loop = "trains in a loop of its own"
     reasons = {
-        "demonstrations": own_loop if external else "",
         "dataset": own_loop if external else "is shown true macrostates" if privileged else "",
         "after": ""
         if isinstance(agent, TransferLearner) or (protocol.unannounced and not external)
         else "has no model of the world to carry over",
-        "unannounced": own_loop if external else "",
+        "after_episodes": "",  # as "after", without which it is refused
         "queries": "" if isinstance(agent, QueryingAgent) else "cannot query an oracle",
-        "feedback": own_loop if external else "",
     }
-    for option, reason in reasons.items():
-        if getattr(protocol, option) and reason:
-            raise UnableError(f"Agent {name!r} {reason}; leave --{option} out, or that agent.")
+    for option in protocol.helps:
+        reason = reasons.get(option, own_loop if external else "")
+        if reason:
+            raise UnableError(f"Agent {name!r} {reason}; leave --{option.replace('_', '-')} out, or that agent.")
 
 
 class Run:

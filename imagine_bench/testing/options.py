@@ -35,7 +35,7 @@ from imagine_bench.running.control import plan_control
 from imagine_bench.running.evaluation import play
 from imagine_bench.running.run_state import Counters, Run, make_env
 from imagine_bench.store import encoders
-from imagine_bench.testing.checks import CheckedAgent, NotOffered, greedy, require, same_arrays
+from imagine_bench.testing.checks import CheckedAgent, NotOffered, greedy, require, same_arrays, same_state
 
 _EPISODES = 2
 _TESTS = 4
@@ -310,4 +310,4 @@ def watching_teaches_as_living(one: CheckedAgent) -> None:
     require(same_arrays(actor.state(), watcher.state()), "it learned otherwise from episodes that it was only shown")
     learned = copy.deepcopy(actor.state())
     require(greedy(actor, starts) == greedy(watcher, starts), "it then acts otherwise")
-    require(same_arrays(learned, actor.state()), "acting with explore=False changes its state")
+    require(same_state(learned, actor.state()), "acting with explore=False changes its state")

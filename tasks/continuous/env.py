@@ -23,7 +23,7 @@ from ..motion.executor import blew_up
 from ..observations import Observer
 from ..parameters.parameters import delivered, hides
 from ..scene_env import BUILT, RENDER_MODES, SceneEnv, Step
-from ..scenes.appearance import Appearance
+from ..scenes.appearance import NUISANCE_FIELDS, Appearance
 from ..scenes.appearance import appearance as appearance_level
 from ..scenes.arm import ARM_JOINTS, arm_columns
 from ..scenes.constants import FAR_CAMERA, FRAME_PX, HUMAN_CAMERA
@@ -181,7 +181,7 @@ class MotionEnv(SceneEnv):
             raise InvalidValueError(
                 "Appearance 'patched' patches images of macrostates; give clean, mild, strong or factors."
             )
-        if level.has_nuisances or level.reward_std or level.reward_step:
+        if any(getattr(level, name) for name, _ in NUISANCE_FIELDS.values()):
             raise InvalidValueError(
                 f"Appearance {level.name!r} has nuisances, which change frames and rewards of macro-actions; give "
                 f"clean, mild, strong or {', '.join(FACTORS)}."

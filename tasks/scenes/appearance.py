@@ -92,16 +92,6 @@ LEVELS: dict[str, Appearance] = {
         ),
         _PHOTO,
         replace(_PHOTO, name=HELD_OUT["photo"]),
-        replace(
-            _CLEAN,
-            name="harsh",
-            shift_px=4.0,
-            shadow_depth=0.5,
-            noise_levels=20.0,
-            occluder_px=8.0,
-            reward_std=0.5,
-            reward_step=0.5,
-        ),
     )
 }
 
@@ -114,15 +104,15 @@ _FIELDS = {
     "hand": ("hand_offset_m", "hand_yaw_rad"),
 }
 """The variations of each factor."""
-_NUISANCES = {
-    "shift": "shift_px",
-    "shadow": "shadow_depth",
-    "noise": "noise_levels",
-    "occlusion": "occluder_px",
-    "reward_noise": "reward_std",
-    "reward_steps": "reward_step",
+NUISANCE_FIELDS = {
+    "shift": ("shift_px", 4.0),
+    "shadow": ("shadow_depth", 0.5),
+    "noise": ("noise_levels", 20.0),
+    "occlusion": ("occluder_px", 8.0),
+    "reward_noise": ("reward_std", 0.5),
+    "reward_steps": ("reward_step", 0.5),
 }
-"""The same of each nuisance."""
+"""The variation of each nuisance, and its value at 1."""
 _DARKEST = 0.95
 """Most of the light that a shadow takes."""
 
@@ -141,10 +131,13 @@ def between(name: str, factors: Mapping[str, float]) -> Appearance:
         for each in fields:
             at = [getattr(level, each) for level in levels.values()]
             widths[each] = float(np.interp(factors.get(factor, 0.0), list(levels), at))
-    for nuisance, each in _NUISANCES.items():
-        widths[each] = factors.get(nuisance, 0.0) * getattr(LEVELS["harsh"], each)
+    for nuisance, (each, at_1) in NUISANCE_FIELDS.items():
+        widths[each] = factors.get(nuisance, 0.0) * at_1
     widths["shadow_depth"] = min(widths["shadow_depth"], _DARKEST)
     return Appearance(name=name, **widths)
+
+
+LEVELS["harsh"] = between("harsh", POINTS["harsh"])
 
 
 def appearance_arrays(model: mujoco.MjModel) -> tuple[Floats, ...]:

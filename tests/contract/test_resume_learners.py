@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from agent_states import count_updates, same
+from agent_states import count_updates
 from numpy.typing import NDArray
 from small_runs import KilledError, final_state, measured, run_observed, small
 from whole_outputs import Expected, rounded
@@ -23,7 +23,7 @@ from imagine_bench.interfaces import AgentState, Observation, capabilities
 from imagine_bench.protocols.data import RunSpec
 from imagine_bench.store import encoders
 from imagine_bench.store.results import RunResult
-from imagine_bench.testing.checks import checked_agent
+from imagine_bench.testing.checks import checked_agent, same_state
 
 LEARNERS = [
     name
@@ -84,8 +84,8 @@ def test_copies_and_pickles_of_a_learner_learn_on_by_themselves(agent: str) -> N
     twins = [restored, copy.deepcopy(original), pickle.loads(pickle.dumps(original))]
     *ends, (actions, state) = [(one.train(each, range(2, 4)), each.state()) for each in (*twins, original)]
     for its_actions, its_state in ends:
-        assert its_actions == actions and same(its_state, state)
-    assert same(early, as_it_was), "a snapshot does not change while the learner learns on"
+        assert its_actions == actions and same_state(its_state, state)
+    assert same_state(early, as_it_was), "a snapshot does not change while the learner learns on"
 
 
 Asked = Callable[[Any, list[Observation], np.random.Generator], object]
@@ -132,9 +132,9 @@ def test_a_learner_that_is_asked_learns_on_as_one_that_is_not(agent: str, monkey
             assert answers[0] == answers[1], capability
     if isinstance(asked, capabilities.FrameReader):
         assert np.array_equal(asked.read_frames(frames), [asked.read_frames(frame[None])[0] for frame in frames])
-    assert same(asked.state(), alone.state())
+    assert same_state(asked.state(), alone.state())
     assert one.train(asked, range(2, 3)) == one.train(alone, range(2, 3))
-    assert same(asked.state(), alone.state())
+    assert same_state(asked.state(), alone.state())
 
 
 @pytest.mark.parametrize("agent", EACH)
@@ -160,6 +160,6 @@ def test_a_killed_learner_ends_in_the_same_bits(
     assert measured(whole) == measured(resumed)
     tables = agent in ("factored", "count_table_own", "elimination") or registry.agents()[agent].encoder_kind == "codes"
     assert tables or any(name.startswith("loss/") for name in whole.checkpoints[-1].diagnostics)
-    assert same(final_state(tmp_path / "whole"), final_state(tmp_path / "run"))
+    assert same_state(final_state(tmp_path / "whole"), final_state(tmp_path / "run"))
     for one, other in zip(whole.imagined, resumed.imagined, strict=True):
         assert np.array_equal(one.rollout.frames, other.rollout.frames)

@@ -1,4 +1,4 @@
-"""Whether two snapshots of agents are equal, and whether an agent that takes one up goes on as the other does."""
+"""The gradient updates of a learner, counted."""
 
 from __future__ import annotations
 
@@ -7,22 +7,6 @@ from collections.abc import Callable
 import pytest
 import torch
 from imagine_bench.agents.networks.adam import Adam
-
-from imagine_bench.interfaces import AgentState
-
-
-def same(first: AgentState, second: AgentState) -> bool:
-    """Equal to the bit, CPU times aside."""
-
-    def untimed(state: AgentState) -> str:
-        meters = {name: value for name, value in state.values["meters"].items() if not name.startswith("time/")}
-        return repr(sorted({**state.values, "meters": meters}.items()))  # in which a NaN equals itself
-
-    return (
-        untimed(first) == untimed(second)
-        and first.arrays.keys() == second.arrays.keys()
-        and all(array.tobytes() == second.arrays[name].tobytes() for name, array in first.arrays.items())
-    )
 
 
 def count_updates(monkeypatch: pytest.MonkeyPatch) -> list[object]:

@@ -8,7 +8,7 @@ import shutil
 import pytest
 
 from imagine_bench import registry
-from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.errors import ArtefactError, InvalidValueError, UnableError
 from imagine_bench.interfaces import APPEARANCES
 from imagine_bench.protocols.control import PRESETS, Protocol, protocol
 from imagine_bench.registry import TASKS, task
@@ -144,6 +144,17 @@ def test_the_caller_overrides_the_task_overrides_the_preset():
     wanted = protocol("pick_place", "quick", budgets=(6,))
     assert (wanted.config_group, wanted.seeds, wanted.budgets) == ("chapter_3", own["seeds"], (6,))
     assert protocol("pick_place", "smoke").seeds == PRESETS["smoke"]["seeds"]
+
+
+def test_each_option_of_training_is_known_as_help_that_needs_a_learner():
+    together = {"after": ("arrow_puzzle_hard",), "after_episodes": 3, "unannounced": True, "feedback": 1.0}
+    used = {**together, "demonstrations": 2, "queries": 1, "feedback_error": 0.1}
+    made = Protocol(task="arrow_puzzle", preset="check", agents=("dqn",), **used)
+    assert sorted(made.helps) == sorted(used)
+    assert not dataclasses.replace(made, **{name: getattr(Protocol, name) for name in used}, budgets=(7,)).helps
+    for changes in ({"demonstrations": 2}, {"queries": 1}, {"feedback": 1.0}):
+        with pytest.raises(UnableError, match=f"No agent of this bench learns .*--{next(iter(changes))} changes"):
+            plan_control("arrow_puzzle", "smoke", agents=("random",), **changes)
 
 
 def test_agents_of_a_file_that_are_no_names_are_refused():

@@ -48,6 +48,12 @@ class _Forgetful(gymnasium.Wrapper[Any, Any, Any, Any]):
         return frame ^ self.noise.integers(2, size=frame.shape, dtype=np.uint8), info
 
 
+class _OneMore(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Has an action that the rules do not know."""
+
+    action_space = gymnasium.spaces.Discrete(7)
+
+
 def _without_options(agent: str) -> Checks:
     """Checks of an agent without those of protocol options, which tests/contract/test_options.py carries out."""
     return {what: check for what, check in checks(agent=agent).items() if not what.startswith("the option")}
@@ -78,6 +84,8 @@ def test_wrong_tasks_are_found(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     monkeypatch.setattr(MacroEnv, "set_state", lambda self, state: None)
     assert "put back in the same environment, it goes on otherwise" in check("middle of an episode")
     made = gymnasium.make
+    monkeypatch.setattr(gymnasium, "make", lambda *given, **named: _OneMore(made(*given, **named)))
+    assert "its action_space is Discrete(7), the rules say Discrete(6)" in check("Gymnasium's checker")
     monkeypatch.setattr(gymnasium, "make", lambda *given, **named: _Forgetful(made(*given, **named)))
     assert "every macrostate is begun in, and told: begun in" in check("is begun in")
     assert "two episodes of seed 0 differ" in check("same seed")
@@ -145,6 +153,35 @@ class _Counting(_Sound):
         return super().act(observation, explore=explore)
 
 
+class _CountsInValues(_Sound):
+    """Keeps a number among the JSON values, not the arrays, and counts in it how often it is asked."""
+
+    asked = 0
+
+    def act(self, observation: Any, *, explore: bool) -> int:
+        self.asked += 1
+        return super().act(observation, explore=explore)
+
+    def state(self) -> AgentState:
+        state = super().state()
+        return AgentState(arrays=state.arrays, values={**state.values, "asked": self.asked})
+
+
+class _SharesValues(_Sound):
+    """A list that grows as it learns, and that the state does not copy."""
+
+    def __init__(self, context: AgentContext) -> None:
+        super().__init__(context)
+        self.rewards: list[float] = []
+
+    def observe(self, transition: Any, *, episode: int) -> None:
+        self.rewards.append(transition.reward)
+
+    def state(self) -> AgentState:
+        state = super().state()
+        return AgentState(arrays=state.arrays, values={**state.values, "rewards": self.rewards})
+
+
 class _Wordy(_Sound):
     def diagnostics(self) -> Any:
         return {"loss": "small"}
@@ -177,6 +214,8 @@ def _none(context: AgentContext) -> None:
         (_none, "it is made: Agent dqn has no method act"),
         (_Wild, "greedily without a change: Action 6 does not exist"),
         (_Counting, "acting with explore=False changes its state"),
+        (_CountsInValues, "acting with explore=False changes its state"),
+        (_SharesValues, "later learning alters a state that it gave before"),
         (_Wordy, "diagnostics: no numbers"),
         (_Sharing, "later learning alters a state that it gave before"),
         (_Uncertain, "it goes on to the same bits: it acts otherwise"),

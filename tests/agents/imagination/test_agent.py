@@ -8,7 +8,6 @@ from unittest import mock
 import numpy as np
 import pytest
 import torch
-from agent_states import same
 from fake_latents import CODES, built, frame, live, make_dqn, transition
 from imagine_bench.agents.dqn import DQN, epsilon
 from imagine_bench.agents.imagination import agent as imagination_agents
@@ -16,6 +15,7 @@ from imagine_bench.agents.imagination import model_only
 
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import AgentState, Observation
+from imagine_bench.testing.checks import same_state
 
 MAKERS: tuple[Callable[..., DQN], ...] = (
     make_dqn,
@@ -147,7 +147,7 @@ def test_a_snapshot_that_does_not_fit_names_the_first_difference() -> None:
     ):
         with pytest.raises(ArtefactError, match=message):
             agent.restore(AgentState(arrays=arrays, values=values))
-    assert same(own, agent.state()), "a refused snapshot changes nothing"
+    assert same_state(own, agent.state()), "a refused snapshot changes nothing"
 
 
 def test_a_context_that_cannot_work_is_one_clear_error() -> None:

@@ -8,7 +8,6 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from agent_states import same
 from counting_model import CountingModel, practising
 from fake_latents import CODES, built, frame, live, make_dqn, transition
 from imagine_bench.agents.dqn import epsilon
@@ -17,6 +16,7 @@ from imagine_bench.agents.imagination import model_only
 from imagine_bench.agents.imagination.model_only import ModelOnlyAgent
 
 from imagine_bench.interfaces import Observation
+from imagine_bench.testing.checks import same_state
 
 
 def made(**changes: Any) -> ModelOnlyAgent:
@@ -89,7 +89,7 @@ def test_training_twice_from_equal_experience_gives_equal_bits() -> None:
     resumed = made(**{"controller.target_rate": 0.1})
     resumed.restore(copy.deepcopy(once.state()))
     assert [train_in_model(each) for each in (once, resumed, twice)] == [5, 5, 8]
-    assert same(once.state(), resumed.state())
+    assert same_state(once.state(), resumed.state())
     assert training(once) == training(twice)
 
 
@@ -142,5 +142,5 @@ def test_a_learner_keeps_its_dynamics_network_and_nothing_else(make) -> None:  #
     assert not any(name.startswith("loss/") for name in learner.diagnostics()), "of a task that is over"
     assert learner.imagination.filter.threshold == 99.0
     first, second = (live(each, range(5), np.random.default_rng(1)) for each in (learner, resumed))
-    assert first == second and same(learner.state(), resumed.state())
+    assert first == second and same_state(learner.state(), resumed.state())
     assert not any(np.array_equal(before[name], learner.state().arrays[name]) for name in kept), "it goes on learning"

@@ -10,7 +10,6 @@ from unittest import mock
 import fake_codes
 import numpy as np
 import pytest
-from agent_states import same
 from fake_codes import ACTIONS, SIZES, agent, frame, live, starts, success
 from imagine_bench_factored.agent import ACCEPTED, FactoredAgent
 from imagine_bench_factored.factors import CodeTransition, contradictions
@@ -26,6 +25,7 @@ from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import AgentContext, AgentState, Observation
 from imagine_bench.interfaces.episodes import joined
 from imagine_bench.seeding import SeedTree
+from imagine_bench.testing.checks import same_state
 
 PLANNING = FactoredSettings().planning
 Code = tuple[int, ...]
@@ -231,7 +231,7 @@ def test_a_snapshot_of_other_factors_or_actions_is_refused(name: str, value: obj
     before = learner.state()
     with pytest.raises(ArtefactError, match=f"{name!r} is .* in the snapshot and"):
         learner.restore(AgentState(arrays=before.arrays, values={**before.values, name: value}))
-    assert same(before, learner.state())
+    assert same_state(before, learner.state())
 
 
 @pytest.fixture(scope="module")

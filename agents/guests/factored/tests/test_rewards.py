@@ -8,13 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from agent_states import same
 from fake_pictures import agent, played
 from imagine_bench_factored.factors import CodeTransition
 from imagine_bench_factored.learned import LearnedPerceptionAgent
 from imagine_bench_factored.rewards import EXACT, reward_classes
 
 from imagine_bench.interfaces import AgentState
+from imagine_bench.testing.checks import same_state
 
 RULED = ((-1.0, False), (-1.0, False), (-1.0, False), (-5.0, True), (-5.0, True), (50.0, True))
 PICKS = ((0.0, False), (1.0, False), (-5.0, True), (5.0, True))
@@ -97,6 +97,6 @@ def test_it_learns_from_noisy_rewards_and_resumes_to_the_same_bits() -> None:
     twin.restore(AgentState(arrays=dict(state.arrays), values=dict(state.values)))
     for each in (learner, twin):
         live(each, range(12, 16))
-    assert same(learner.state(), twin.state())
+    assert same_state(learner.state(), twin.state())
     assert learner.rewards is not EXACT
     assert len(learner.model.outcomes.outcomes) < 0.2 * len(learner.replay), "not one outcome for each reward"
