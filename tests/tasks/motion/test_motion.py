@@ -125,14 +125,16 @@ def test_only_contact_turns_the_cube():
     assert fault == "the fingers closed past cube 1"
 
 
-def test_an_arm_of_which_one_joint_does_not_come_back_is_a_fault():
-    """The wrist's 9 Nm hold a spring of 10 Nm/rad, whose rest is a radian away, 0.1 rad off."""
+@pytest.mark.parametrize(("rest_rad", "off_rad"), [(-1.0, "0.101"), (1.0, "0.100")])
+def test_an_arm_of_which_one_joint_does_not_come_back_is_a_fault(rest_rad, off_rad):
+    """The wrist's 9 Nm hold a spring of 10 Nm/rad, whose rest is a radian away to either side, 0.1 rad off."""
 
     def pulled_wrist(model):
         joint = model.joint("right_j6")
-        model.jnt_stiffness[joint.id], model.qpos_spring[joint.qposadr[0]] = 10.0, OBSERVATION_QPOS_RAD[6] + 1.0
+        model.jnt_stiffness[joint.id] = 10.0
+        model.qpos_spring[joint.qposadr[0]] = OBSERVATION_QPOS_RAD[6] + rest_rad
 
-    assert turned(pulled_wrist)[1] == "the arm ended 0.100 rad off its observation pose"
+    assert turned(pulled_wrist)[1] == f"the arm ended {off_rad} rad off its observation pose"
 
 
 @pytest.mark.parametrize(
