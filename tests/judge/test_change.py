@@ -116,7 +116,8 @@ def test_false_alarms_are_as_rare_as_promised() -> None:
     assert shares[2] > 0.9
 
 
-def test_alarms_of_a_world_depend_on_no_other_but_the_unchanged_one() -> None:
+def test_alarms_depend_on_the_unchanged_world_and_their_own() -> None:
+    """Streams of a second changed world in the same call change no alarm."""
     there = judged_world("pick_place")
     answers = there.predictions(Altered(there, unsure), there.one_step)
     usual, *changed = (there.streams[name] for name in ("usual", "slip", "coupling"))

@@ -278,7 +278,7 @@ def test_kill_9_of_a_real_process_changes_nothing(tmp_path: Path) -> None:
 def test_a_kill_after_any_checkpoint_changes_nothing(
     tmp_path: Path, die_after_saves: Callable[..., None], save: int
 ) -> None:
-    """Of training, within a test, at its end, and after the run's last one."""
+    """A checkpoint of training, one within a test, the one at its end, and the last one of the run."""
     changes: dict[str, Any] = {"budgets": (2, 4), "evaluation_episodes": 2}
     whole = do(tmp_path / "whole", **changes)
     die_after_saves(save)

@@ -295,8 +295,8 @@ def test_frames_of_a_websocket(
     line.close()
 
 
-def test_a_websocket_keeps_the_player_of_a_reset_and_nothing_else(refusing: Server) -> None:
-    """Neither a seed, for which a reset is refused, nor an action."""
+def test_a_websocket_keeps_only_the_player_of_a_reset(refusing: Server) -> None:
+    """A seed, for which a reset is refused, and an action are forgotten."""
     line = Line(refusing)
 
     def say(kind: str, **data: Any) -> Any:
