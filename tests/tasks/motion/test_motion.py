@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.world import ArrowWorld
 from imagine_bench.tasks.motion.arm_model import ArmModel
-from imagine_bench.tasks.motion.executor import MAX_SAVED
+from imagine_bench.tasks.motion.executor import MAX_SAVED, blew_up
 from imagine_bench.tasks.scenes.appearance import Appearance
 from imagine_bench.tasks.scenes.arm import arm_columns
 from imagine_bench.tasks.scenes.constants import OBSERVATION_QPOS_RAD, TIMESTEP_S
@@ -153,6 +153,17 @@ def test_what_the_robot_cannot_do_is_a_fault(world, columns, values, message):
     assert message in result.fault
     assert (result.sim_time_s, len(result.motion.qpos)) == (0.0, 0)
     np.testing.assert_array_equal(world.object_poses(), before)
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_a_joint_that_runs_away_to_either_side_is_noticed(world, sign):
+    """Nothing in the scene moves at 200 rad/s."""
+    place(world)
+    found = []
+    for speed in (150, 250):
+        world.data.qvel[0] = sign * speed
+        found.append(blew_up(world.data))
+    assert found == [False, True]
 
 
 def explode(world, said):
