@@ -116,6 +116,19 @@ def test_false_alarms_are_as_rare_as_promised() -> None:
     assert shares[2] > 0.9
 
 
+def test_alarms_depend_on_the_unchanged_world_and_their_own() -> None:
+    """Streams of a second changed world in the same call change no alarm."""
+    there = judged_world("pick_place")
+    answers = there.predictions(Altered(there, unsure), there.one_step)
+    usual, *changed = (there.streams[name] for name in ("usual", "slip", "coupling"))
+    (quiet,) = alarms([usual], answers)
+    both = alarms([usual, *changed], answers)
+    assert np.array_equal(both[0], quiet)
+    for found, streams in zip(both[1:], changed, strict=True):
+        assert np.array_equal(alarms([usual, streams], answers), [quiet, found])
+    assert len(np.unique(both[2])) > 10, "the moments of these alarms differ"
+
+
 @BOTH
 def test_copy_is_right_where_nothing_changes_exact_everywhere(task: str) -> None:
     there = judged_world(task)

@@ -20,7 +20,7 @@ import bench_fakes
 import numpy as np
 import pytest
 from imagine_bench.tasks.macro_env import MacroEnv
-from small_runs import do, final_arrays, run_observed, same_but_for_time, small, written
+from small_runs import KilledError, do, final_arrays, run_observed, same_but_for_time, small, written
 
 from imagine_bench import registry
 from imagine_bench.cli import observers
@@ -272,6 +272,21 @@ def test_kill_9_of_a_real_process_changes_nothing(tmp_path: Path) -> None:
     assert 40 < snapshot.episode < 80  # non-vacuous: the last kill came half way
     assert same_but_for_time(whole, do(folder, **changes))
     assert final_arrays(tmp_path / "whole")["table"].tobytes() == final_arrays(folder)["table"].tobytes()
+
+
+@pytest.mark.parametrize("save", range(1, 11))
+def test_a_kill_after_any_checkpoint_changes_nothing(
+    tmp_path: Path, die_after_saves: Callable[..., None], save: int
+) -> None:
+    """A checkpoint of training, one within a test, the one at its end, and the last one of the run."""
+    changes: dict[str, Any] = {"budgets": (2, 4), "evaluation_episodes": 2}
+    whole = do(tmp_path / "whole", **changes)
+    die_after_saves(save)
+    with pytest.raises(KilledError):
+        do(tmp_path / "run", every_s=0.0, **changes)
+    resumed = do(tmp_path / "run", every_s=0.0, **changes)
+    assert same_but_for_time(whole, resumed)
+    assert final_arrays(tmp_path / "whole")["table"].tobytes() == final_arrays(tmp_path / "run")["table"].tobytes()
 
 
 def test_a_table_that_a_kill_left_behind_comes_with_the_run(tmp_path: Path) -> None:

@@ -6,6 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.world import ArrowWorld
+from imagine_bench.tasks.pick_place.rules import HANDED_OVER, OPEN_PALM
+from imagine_bench.tasks.pick_place.scene import PALM_M
 from imagine_bench.tasks.pick_place.world import PickWorld
 from imagine_bench.tasks.scenes.appearance import LEVELS, Appearance
 from imagine_bench.tasks.scenes.constants import ARM_GROUP
@@ -41,23 +43,50 @@ def test_macrostates_are_read_back_at_every_level(name, level):
 DISPLACED = {"x m": (0.014, 0.016, 0.018, 0.021), "z m": (0.005, 0.05), "yaw": (19, 21, 25, 90), "tilt": (8, 12, 90)}
 
 
+def read_displaced(world, index, how, amount):
+    """What is read where an object is moved, or turned by degrees, off its place."""
+    world.place((0, 0, 0, 0), np.random.default_rng(0))
+    row = world.object_qpos[index]
+    if how.endswith("m"):
+        world.data.qpos[row["xyz".index(how[0])]] += amount
+    else:
+        quat = np.zeros(4)
+        mujoco.mju_axisAngle2Quat(quat, np.eye(3)[2 if how == "yaw" else 0], np.radians(amount))
+        world.data.qpos[row[3:]] = quat
+    return world.read()
+
+
 def test_what_is_read_of_displaced_objects(expected):
-    """Each object of a scene moved, or turned by degrees, off its place."""
     rows = []
     for world in (world_of("arrow_puzzle", FIXED), world_of("pick_place", FIXED)):
         for index, name in enumerate(world.object_names):
             for how, amount in ((how, amount) for how, amounts in DISPLACED.items() for amount in amounts):
-                world.place((0, 0, 0, 0), np.random.default_rng(0))
-                row = world.object_qpos[index]
-                if how.endswith("m"):
-                    world.data.qpos[row["xyz".index(how[0])]] += amount
-                else:
-                    quat = np.zeros(4)
-                    mujoco.mju_axisAngle2Quat(quat, np.eye(3)[2 if how == "yaw" else 0], np.radians(amount))
-                    world.data.qpos[row[3:]] = quat
-                reading = world.read()
+                reading = read_displaced(world, index, how, amount)
                 rows.append([name, how, amount, reading.macrostate, reading.problem])
     expected("displaced_objects", tabulated(rows))
+
+
+@pytest.mark.parametrize("name", ["arrow_puzzle", "pick_place"])
+def test_displaced_objects_have_the_same_fault_to_both_sides(name):
+    world = world_of(name, FIXED)
+    for index in range(len(world.object_names)):
+        for how, amounts in DISPLACED.items():
+            for amount in amounts:
+                one, other = (read_displaced(world, index, how, sign * amount).problem for sign in (1, -1))
+                assert one == other, (world.object_names[index], how, amount)
+
+
+@pytest.mark.parametrize("index", range(len(OBJECTS)))
+def test_an_object_is_in_the_palm_at_its_height_alone(index):
+    world = world_of("pick_place", FIXED)
+    world.place((0, 0, 0, OPEN_PALM), np.random.default_rng(0))
+    row = world.object_qpos[index]
+    found = []
+    for above_m in (-0.03, 0.0, 0.03):
+        lies_m = (0.0, 0.0, OBJECTS[index].grip_height_m + above_m)
+        world.data.qpos[row[:3]] = np.add(PALM_M, lies_m)
+        found.append(world.read().macrostate[index])
+    assert found == [0, HANDED_OVER, 0]
 
 
 @pytest.mark.parametrize("name", NAMES)

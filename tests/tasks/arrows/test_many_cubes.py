@@ -1,5 +1,7 @@
 """One to six cubes: placed and read back, turned with no neighbour moved, turned in twos, and slipping."""
 
+import math
+
 import gymnasium
 import numpy as np
 import pytest
@@ -37,15 +39,16 @@ def test_fingers_open_no_wider_than_there_is_room(seed):
     env.close()
 
 
+@pytest.mark.parametrize("turned_deg", [-20, 0, 20])
 @pytest.mark.parametrize("clockwise", [True, False])
-def test_fingers_open_as_far_as_there_is_room(clockwise):
-    """The next cube of its row stands 9 mm nearer, and the cube is put down 9 mm nearer to that."""
+def test_fingers_open_as_far_as_there_is_room(clockwise, turned_deg):
+    """The next cube of its row stands 9 mm nearer, and the cube is put down 9 mm nearer to that, turned either way."""
     world = _world(cubes=6, forbid="none")
     world.place((0,) * 6 + (0,), np.random.default_rng(0))
     assert world.layout.slots_xy_m[1][0] == world.layout.slots_xy_m[3][0], "they stand side by side"
     world.data.qpos[world.object_qpos[3][1]] += 0.009
     before = world.object_poses()
-    assert world.executor.turn(cube=1, clockwise=clockwise, noise=(0.0, -0.009, 0.0)).fault is None
+    assert world.executor.turn(cube=1, clockwise=clockwise, noise=(0.0, -0.009, math.radians(turned_deg))).fault is None
     shift_m = np.linalg.norm(world.object_poses()[:, :3] - before[:, :3], axis=1)
     assert np.delete(shift_m, 1).max() < 1e-4 and shift_m[1] > 0.008
 

@@ -147,6 +147,20 @@ def test_dense_rewards_sum_to_sparse_ones_less_the_potential(family: str) -> Non
     assert early > 0.6
 
 
+@pytest.mark.parametrize("before", range(4))
+@pytest.mark.parametrize("sense", [-1, 1])
+def test_a_dense_reward_pays_the_way_to_either_next_direction(before: int, sense: int) -> None:
+    """A sixth of a quarter turn toward the goal is a sixth of the 0.6 of its potential; one away from it is none."""
+    env, _ = environment("arrows", reward="dense", cubes=1, goal=str((before + sense) % 4), forbid="none")
+    env.reset(seed=0, options={"macrostate": (before, 0)})
+    paid = []
+    for turned_deg in (0, -15, 0, 15):
+        yaw_rad = math.radians(-90 * before - turned_deg * sense)
+        env.data.qpos[env.world.object_qpos[0, 3:]] = about_vertical(yaw_rad)
+        paid.append(env.step(np.zeros(7, dtype=np.float32))[1])
+    assert paid[1:] == pytest.approx([0.0, 0.0, 0.1], abs=1e-3)
+
+
 @pytest.mark.parametrize("family", FAMILIES)
 def test_a_dense_reward_keeps_no_potential_after_a_fault(family: str) -> None:
     """The episode ends in a macrostate from which the rules would go on; the fault costs what it costs, and no more."""

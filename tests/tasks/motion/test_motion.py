@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.world import ArrowWorld
 from imagine_bench.tasks.motion.arm_model import ArmModel
-from imagine_bench.tasks.motion.executor import MAX_SAVED
+from imagine_bench.tasks.motion.executor import MAX_SAVED, blew_up
 from imagine_bench.tasks.scenes.appearance import Appearance
 from imagine_bench.tasks.scenes.arm import arm_columns
 from imagine_bench.tasks.scenes.constants import OBSERVATION_QPOS_RAD, TIMESTEP_S
@@ -125,14 +125,16 @@ def test_only_contact_turns_the_cube():
     assert fault == "the fingers closed past cube 1"
 
 
-def test_an_arm_of_which_one_joint_does_not_come_back_is_a_fault():
-    """The wrist's 9 Nm hold a spring of 10 Nm/rad, whose rest is a radian away, 0.1 rad off."""
+@pytest.mark.parametrize(("rest_rad", "off_rad"), [(-1.0, "0.101"), (1.0, "0.100")])
+def test_an_arm_of_which_one_joint_does_not_come_back_is_a_fault(rest_rad, off_rad):
+    """The wrist's 9 Nm hold a spring of 10 Nm/rad, whose rest is a radian away to either side, 0.1 rad off."""
 
     def pulled_wrist(model):
         joint = model.joint("right_j6")
-        model.jnt_stiffness[joint.id], model.qpos_spring[joint.qposadr[0]] = 10.0, OBSERVATION_QPOS_RAD[6] + 1.0
+        model.jnt_stiffness[joint.id] = 10.0
+        model.qpos_spring[joint.qposadr[0]] = OBSERVATION_QPOS_RAD[6] + rest_rad
 
-    assert turned(pulled_wrist)[1] == "the arm ended 0.100 rad off its observation pose"
+    assert turned(pulled_wrist)[1] == f"the arm ended {off_rad} rad off its observation pose"
 
 
 @pytest.mark.parametrize(
@@ -151,6 +153,17 @@ def test_what_the_robot_cannot_do_is_a_fault(world, columns, values, message):
     assert message in result.fault
     assert (result.sim_time_s, len(result.motion.qpos)) == (0.0, 0)
     np.testing.assert_array_equal(world.object_poses(), before)
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_a_joint_that_runs_away_to_either_side_is_noticed(world, sign):
+    """Nothing in the scene moves at 200 rad/s."""
+    place(world)
+    found = []
+    for speed in (150, 250):
+        world.data.qvel[0] = sign * speed
+        found.append(blew_up(world.data))
+    assert found == [False, True]
 
 
 def explode(world, said):

@@ -16,7 +16,7 @@ from imagine_bench_controls.memory import drqn, imagination, readout, world_mode
 from imagine_bench_controls.memory.agent import RememberingAgent
 from imagine_bench_controls.memory.sequences import START, Recurrence, SequenceMemory
 
-from imagine_bench.interfaces import Frame, Observation
+from imagine_bench.interfaces import AgentState, Frame, Observation
 from imagine_bench.interfaces.episodes import joined
 
 UNITS = 16
@@ -152,6 +152,25 @@ def test_a_full_ring_replays_whole_pieces_only() -> None:
     for z, reward in zip(batch.z, batch.reward, strict=True):
         number, t = divmod(int(reward), 100)
         assert torch.allclose(z, truth[number - 1][t], atol=1e-6), "the stored memory stands in for overwritten steps"
+
+
+@pytest.mark.parametrize(("rate", "moves"), [(1e-6, False), (1.0, True)])
+def test_targets_remember_with_the_target_network(rate: float, moves: bool) -> None:
+    """Updates move the states of the values. The states of the targets move at the rate of the target network."""
+    agent = make("drqn", **{"controller.target_rate": rate})
+    recall(agent, range(4), np.random.default_rng(0))
+    begun = agent.state()
+    before = agent.draw_batch(agent.real)
+    for _ in range(5):
+        agent.controller.update(agent.draw_batch(agent.real))
+    generator = "generator/replay"
+    learned = agent.state()
+    arrays = {**learned.arrays, generator: begun.arrays[generator]}
+    agent.restore(AgentState(arrays=arrays, values=learned.values))
+    after = agent.draw_batch(agent.real)
+    assert torch.equal(after.action, before.action) and torch.equal(after.reward, before.reward), "the same transitions"
+    assert (after.z - before.z).abs().max() > 1e-3
+    assert ((after.next_z - before.next_z).abs().max() > 1e-3) == moves
 
 
 def test_no_gradient_goes_through_the_burn_in() -> None:

@@ -6,9 +6,11 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
+import fake_codes
 import numpy as np
 import pytest
 from fake_pictures import agent, played
+from imagine_bench_factored.agent import FactoredAgent
 from imagine_bench_factored.factors import CodeTransition
 from imagine_bench_factored.learned import LearnedPerceptionAgent
 from imagine_bench_factored.rewards import EXACT, reward_classes
@@ -86,6 +88,38 @@ def live(learner: LearnedPerceptionAgent, episodes: range) -> None:
         for transition in played(learner, np.random.default_rng((0, episode)), explore=True):
             noisy = transition.reward + 0.2 * float(noise.standard_normal())
             learner.observe(replace(transition, reward=noisy), episode=episode)
+
+
+@pytest.mark.parametrize("begins", [0, 4])
+def test_a_resumed_run_classes_rewards_by_the_same_transitions(begins: int) -> None:
+    """A restored agent knows which transitions of the present task had been classed.
+
+    The task begins after so many episodes with exact rewards.
+    """
+
+    def live_drawn(learner: FactoredAgent, episode: int) -> None:
+        rng = np.random.default_rng((0, episode))
+        learner.begin_episode()
+        for row in fake_codes.drawn(rng):
+            exact = fake_codes.transition(row.code, row.action)
+            noise = 0.5 * float(rng.standard_normal()) if episode >= begins else 0.0
+            learner.observe(replace(exact, reward=exact.reward + noise), episode=episode)
+
+    learner = fake_codes.agent()
+    resumptions = 0
+    for episode in range(begins + 20):
+        if episode == begins:
+            learner.reset_for_new_task()
+        state = learner.state()
+        resumes = learner.rewards is not EXACT and learner.classed < len(learner.replay)
+        live_drawn(learner, episode)
+        if resumes:
+            resumed = fake_codes.agent()
+            resumed.restore(state)
+            live_drawn(resumed, episode)
+            assert same(learner.state(), resumed.state())
+            resumptions += 1
+    assert resumptions > 5
 
 
 @pytest.mark.slow

@@ -295,6 +295,22 @@ def test_frames_of_a_websocket(
     line.close()
 
 
+def test_a_websocket_keeps_only_the_player_of_a_reset(refusing: Server) -> None:
+    """A seed, for which a reset is refused, and an action are forgotten."""
+    line = Line(refusing)
+
+    def say(kind: str, **data: Any) -> Any:
+        return line.say(json.dumps({"type": kind, "data": data}).encode())
+
+    assert "leave the seed out" in say("reset", player="eve", seed=3)["data"]["message"]
+    begun = say("reset")["data"]["metadata"]
+    assert (begun["player"], begun["step_count"]) == ("reader:eve", 0)
+    assert say("reset", action=0)["type"] == "observation"
+    assert "Action None does not exist" in say("step")["data"]["message"]
+    assert say("step", action=0)["data"]["metadata"] == {**begun, "step_count": 1}
+    line.close()
+
+
 @pytest.fixture(scope="module")
 def refusing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     with served(tmp_path_factory.mktemp("runs")) as one:
