@@ -61,7 +61,7 @@ def test_what_an_untried_action_does_is_imagined_as_expected(sizes: Code) -> Non
 def test_nothing_is_learned_from_transitions_that_are_not_clear() -> None:
     seen = rows(starts())
     false = [row._replace(reward=-row.reward, terminated=not row.terminated, is_first=True) for row in seen]
-    unclear = [row._replace(is_clear=False) for row in false]
+    unclear = [row._replace(**{which: False}) for row in false for which in ("code_is_clear", "following_is_clear")]
     alone, both, misled = (fitted([*seen, *more]) for more in ([], unclear, false))
     expected = alone.probabilities(seen)
     np.testing.assert_array_equal(both.probabilities(seen), expected)

@@ -5,18 +5,20 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
 from fake_codes import ACTIONS, drawn, starts
 from fake_pictures import Code, agent, picture, played, shape
+from imagine_bench_factored.factors import CodeTransition, Memory, remembering
 from imagine_bench_factored.learned import LearnedPerceptionAgent
-from imagine_bench_factored.perception import LearnedPerception
+from imagine_bench_factored.perception import FrameCodes, LearnedPerception
 from imagine_bench_factored.seeing import appearance
 from imagine_bench_factored.settings import LearnedPerceptionSettings
 from numpy.typing import NDArray
 
-from imagine_bench.interfaces import AgentState, Frame, Observation
+from imagine_bench.interfaces import AgentState, Frame, Observation, Transition
 from imagine_bench.seeding import SeedTree
 
 
@@ -194,33 +196,88 @@ def test_a_faint_edge_in_an_empty_place_is_no_value() -> None:
 class _Doubtful(LearnedPerception):
     """Is unsure of frames whose first pixel is black."""
 
-    def codes(self, frames: Frame) -> tuple[list[Code], NDArray[np.bool_], NDArray[np.bool_]]:
-        codes, known, _ = super().codes(frames)
-        return codes, known, frames[:, 0, 0].any(axis=-1)
+    def codes(self, frames: Frame) -> FrameCodes:
+        return super().codes(frames)._replace(clear=frames[:, 0, 0].any(axis=-1))
+
+
+def doubtful_agent() -> LearnedPerceptionAgent:
+    settings = agent().settings
+    return LearnedPerceptionAgent(_Doubtful(settings.perception, factored=True), ACTIONS, settings, SeedTree(0))
+
+
+def doubtful(transition: Transition, *, before: bool, after: bool) -> Transition:
+    """A transition whose frames are as clear as is told."""
+    seen = []
+    for observation, is_clear in ((transition.observation, before), (transition.next_observation, after)):
+        frame = observation.frame.copy()
+        frame[0, 0] *= is_clear
+        seen.append(Observation(frame=frame))
+    return replace(transition, observation=seen[0], next_observation=seen[1])
 
 
 def test_a_transition_is_clear_if_both_of_its_frames_are() -> None:
     """Also once factors were found anew, and in a snapshot."""
     rng = np.random.default_rng(0)
-    settings = agent().settings
-    learner, again = (
-        LearnedPerceptionAgent(_Doubtful(settings.perception, factored=True), ACTIONS, settings, SeedTree(0))
-        for _ in "ab"
-    )
+    learner, again = doubtful_agent(), doubtful_agent()
     clear = []
     for episode in range(12):
         for transition in played(None, rng):
-            frames = [transition.observation.frame.copy(), transition.next_observation.frame.copy()]
-            doubtful = rng.random(2) < 0.2
-            for frame, each in zip(frames, doubtful, strict=True):
-                frame[0, 0] *= not each
-            before, after = (Observation(frame=frame) for frame in frames)
-            learner.observe(replace(transition, observation=before, next_observation=after), episode=episode)
-            clear.append(not doubtful.any())
-    assert len(learner.perception.history) > 2 and 0.4 < np.mean(clear) < 0.8
-    assert [row.is_clear for row in learner.replay] == clear
+            before, after = (rng.random(2) >= 0.2).tolist()
+            learner.observe(doubtful(transition, before=before, after=after), episode=episode)
+            clear.append((before, after))
+    assert len(learner.perception.history) > 2
+    assert [(row.code_is_clear, row.following_is_clear) for row in learner.replay] == clear
+    assert [row.is_clear for row in learner.replay] == [all(each) for each in clear]
     again.restore(learner.state())
     assert again.replay == learner.replay
+
+
+@pytest.mark.parametrize(("before", "after"), [(True, True), (False, True), (True, False)])
+def test_it_plans_anew_after_clear_surprises_alone(before: bool, after: bool) -> None:
+    learner = doubtful_agent()
+    for episode in range(12):
+        for transition in played(None, np.random.default_rng(episode)):
+            learner.observe(doubtful(transition, before=True, after=True), episode=episode)
+    learner.classed = len(learner.replay)  # rewards are not due to be classed
+    surprise = doubtful(replace(transition, reward=7.5), before=before, after=after)
+    with (
+        mock.patch.object(learner.perception, "renew", return_value=False),
+        mock.patch.object(learner, "learn", wraps=learner.learn) as learned,
+    ):
+        learner.observe(surprise, episode=12)
+    assert learned.called == (before and after)
+    assert learner.replay[-1].reward == 7.5, "it is kept"
+
+
+def test_memory_takes_values_of_clear_frames_alone() -> None:
+    """The codes that it acts on are those that it learns from."""
+    rng = np.random.default_rng(0)
+    learner = doubtful_agent()
+    eyes = learner.perception
+    for episode in range(12):
+        for transition in played(None, rng):
+            learner.observe(doubtful(transition, before=True, after=True), episode=episode)
+    lamp = eyes.seen_sizes.index(2)
+    for hidden in (0, 1):
+        eyes.memory = Memory(lamp, hidden)
+        lived, rows, begins = [], [], []
+        for _ in range(12):
+            eyes.begin_episode()
+            is_clear = rng.random() >= 0.4
+            for step, transition in enumerate(played(None, rng)):
+                begins.append(step == 0)
+                clear = [is_clear, bool(rng.random() >= 0.4)]
+                seen = doubtful(transition, before=clear[0], after=clear[1])
+                frames = (seen.observation.frame, seen.next_observation.frame)
+                codes = [eyes.code(frame) for frame in frames]
+                lived.append([code[-1] for code in codes])
+                bare = CodeTransition(codes[0][:-1], 0, codes[1][:-1], 0.0, False)
+                rows.append(bare._replace(code_is_clear=clear[0], following_is_clear=clear[1]))
+                is_clear = clear[1]
+        found = remembering(rows, begins, eyes.memory)
+        assert [[row.code[-1], row.following[-1]] for row in found] == lived
+        of_all = [row._replace(code_is_clear=True, following_is_clear=True) for row in rows]
+        assert [row[:3] for row in remembering(of_all, begins, eyes.memory)] != [row[:3] for row in found]
 
 
 def test_a_look_that_was_never_seen_is_unknown() -> None:
@@ -289,7 +346,7 @@ def test_it_learns_to_see_and_to_act_from_nothing(trained: Trained) -> None:
 def test_remembered_transitions_get_their_frames_present_codes(trained: Trained) -> None:
     learner, _ = trained
     eyes = learner.perception
-    codes, _, _ = eyes.codes(np.stack(eyes.frames))
+    codes = eyes.codes(np.stack(eyes.frames)).values
     looked = [row for row in zip(learner.replay, eyes.transitions, strict=True) if row[1][1] < eyes.looked_at]
     assert looked
     assert all(row.code == codes[before] and row.following == codes[after] for row, (before, after) in looked)

@@ -77,6 +77,32 @@ def test_rewards_that_differ_in_a_third_of_all_sightings_are_noisy_if_by_little(
         assert reward_classes(given).centers[True] == pytest.approx([-5.0, 50.0], abs=0.3)
 
 
+@pytest.mark.parametrize(
+    ("cost", "noisy"),
+    [("chance", True), ("much", False), ("action", False), ("next", False), ("both", False), ("few", False)],
+)
+def test_small_differences_that_nothing_explains_are_noise_before_anything_came_twice(
+    cost: str, *, noisy: bool
+) -> None:
+    """Rewards that an action, a value or two values explain are exact, and so are those that differ by much."""
+    rng = np.random.default_rng(0)
+    given = []
+    for number in range(12 if cost == "few" else 40):
+        code = (number, *rng.integers(4, size=2).tolist())  # the first value never comes again
+        action = int(rng.integers(3))
+        after = (number, (code[1] + 1) % 4, int(rng.integers(4)))
+        step = {"action": action, "next": after[2], "both": (code[1] + after[2]) % 3}.get(cost, int(rng.integers(3)))
+        outcome = RULED[int(rng.integers(len(RULED)))]
+        reward = outcome[0] + (60.0 if cost == "much" else 0.5) * (step - 1)
+        given.append(CodeTransition(code, action, after, reward, outcome[1]))
+    assert len({row[:3] for row in given}) == len(given)
+    found = reward_classes([row for row in given if row.reward < 20.0] if cost != "much" else given)
+    assert (found is not EXACT) == noisy
+    if noisy:
+        assert found.centers[False] == pytest.approx([-1.0], abs=0.3)
+        assert found.centers[True] == pytest.approx([-5.0], abs=0.3)
+
+
 def test_a_few_rewards_make_no_class_of_their_own() -> None:
     found = reward_classes(rows(30, std=0.5))
     assert len(found.centers[False]) == 1 and len(found.centers[True]) <= 3

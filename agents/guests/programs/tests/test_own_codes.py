@@ -9,7 +9,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from imagine_bench_factored.perception import FrameFactors, LearnedPerception
+from imagine_bench_factored.perception import FrameCodes, FrameFactors, LearnedPerception
 from imagine_bench_factored.seeing.appearance import SeenFactor
 from imagine_bench_factored.seeing.standard import Standard
 from imagine_bench_programs.__main__ import _explore, written
@@ -42,13 +42,13 @@ class BytePerception(LearnedPerception):
         self.fine = self.frame_factors
         self.left = renews_at
 
-    def codes(self, frames: Frame) -> tuple[list[State], NDArray[np.bool_], NDArray[np.bool_]]:
+    def codes(self, frames: Frame) -> FrameCodes:
         values = frames[:, 0, 0, 0] // (1 if self.frame_factors is self.fine else 2)
         every = np.ones(len(frames), dtype=bool)
-        return [(int(value),) for value in values], every[:, None], every
+        return FrameCodes([(int(value),) for value in values], every[:, None], every)
 
     def code(self, frame: Frame) -> State:
-        return self.codes(frame[None])[0][0]
+        return self.codes(frame[None]).values[0]
 
     def remember(self, before: Frame, action: int, after: Frame, *, begins: bool = False) -> None:
         self.left -= 1
@@ -101,13 +101,14 @@ class PixelPerception(LearnedPerception):
         self._factored = True
         self.take(FrameFactors(factors, Standard()), 0)
 
-    def codes(self, frames: Frame) -> tuple[list[State], NDArray[np.bool_], NDArray[np.bool_]]:
+    def codes(self, frames: Frame) -> FrameCodes:
         places = [factor.joint.shape[1] for factor in self.found]
         codes = [tuple(row) for row in frames[:, 0, places, 0].tolist()]
-        return codes, np.ones((len(frames), len(places)), dtype=bool), np.ones(len(frames), dtype=bool)
+        known = np.ones((len(frames), len(places)), dtype=bool)
+        return FrameCodes(codes, known, known.all(axis=1))
 
     def code(self, frame: Frame) -> State:
-        return self.codes(frame[None])[0][0]
+        return self.codes(frame[None]).values[0]
 
 
 @pytest.mark.parametrize("matters", [False, True])

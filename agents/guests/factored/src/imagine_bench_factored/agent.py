@@ -146,18 +146,23 @@ class CodeAgent:
         return best > 0.0 and bool(self._values(code).max() >= planning.discount**planning.depth * best)
 
     def observe(self, transition: Transition, *, episode: int) -> None:
-        """Keep the transition; if it was unexpected, learn from all since the last one, and plan anew."""
+        """Keep the transition; if it was clear and unexpected, learn from all since the last one, and plan anew."""
+        before = transition.observation.frame
+        after = transition.next_observation.frame
         with self.meters.cpu_time("time/model_s"):
-            code = self.perception.code(transition.observation.frame)
-            following = self.perception.code(transition.next_observation.frame)
-            row = CodeTransition(code, transition.action, following, transition.reward, transition.terminated)
-            frames = (transition.observation.frame, transition.next_observation.frame)
-            is_clear = all(map(self.perception.is_clear, frames))
-            row = row._replace(is_first=self._observed == 0, is_clear=is_clear)
+            row = CodeTransition(
+                code=self.perception.code(before),
+                action=transition.action,
+                following=self.perception.code(after),
+                reward=transition.reward,
+                terminated=transition.terminated,
+                is_first=self._observed == 0,
+                code_is_clear=self.perception.is_clear(before),
+                following_is_clear=self.perception.is_clear(after),
+            )
             self._observed += 1
             class_reward = self.rewards.reward(row)
-            (probability,), (unknown,) = self.model.probabilities([row._replace(reward=class_reward)])
-            unexpected = bool(probability < _EXPECTED or unknown > self.settings.planning.exploration_threshold)
+            unexpected = row.is_clear and self._is_unexpected(row._replace(reward=class_reward))
             self.replay.append(row)
             self.class_rewards.append(class_reward)
             due = len(self.replay) - self._task_start >= _REWARDS_GROWTH * (self.classed - self._task_start)
@@ -169,6 +174,10 @@ class CodeAgent:
         self.meters.count("time/model_s")
         if transition.terminated or transition.truncated:
             self.begin_episode()
+
+    def _is_unexpected(self, row: CodeTransition) -> bool:
+        (probability,), (unknown,) = self.model.probabilities([row])
+        return bool(probability < _EXPECTED or unknown > self.settings.planning.exploration_threshold)
 
     @property
     def _task_start(self) -> int:
@@ -287,7 +296,8 @@ def completed(state: AgentState) -> AgentState:
     arrays = {
         "replay/class_reward": rewards.astype(np.float64),
         "replay/is_first": np.zeros(len(rewards), dtype=np.bool_),
-        "replay/is_clear": np.ones(len(rewards), dtype=np.bool_),
+        "replay/code_is_clear": np.ones(len(rewards), dtype=np.bool_),
+        "replay/following_is_clear": np.ones(len(rewards), dtype=np.bool_),
         **state.arrays,
     }
     return AgentState(arrays=arrays, values={"classed": len(rewards), **state.values})

@@ -36,7 +36,7 @@ class CodeTransition(NamedTuple):
     ``has_dynamics``: it happened, and so shows the order of codes; False if it was only asked about.
     ``has_reward``: reward and end are known; False if a query about it got no label.
     ``is_first``: an episode began with it.
-    ``is_clear``: both codes are certain; nothing is learned from others, as where an object was hidden.
+    ``code_is_clear``, ``following_is_clear``: False where a hidden part leaves more than one value possible.
     """
 
     code: Code
@@ -47,7 +47,13 @@ class CodeTransition(NamedTuple):
     has_dynamics: bool = True
     has_reward: bool = True
     is_first: bool = False
-    is_clear: bool = True
+    code_is_clear: bool = True
+    following_is_clear: bool = True
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether both codes are clear. Nothing is learned from other transitions."""
+        return self.code_is_clear and self.following_is_clear
 
 
 def as_arrays(rows: Sequence[CodeTransition], factors: int) -> Arrays:
@@ -89,14 +95,19 @@ class Memory(NamedTuple):
 
 
 def remembering(rows: Sequence[CodeTransition], begins: Iterable[bool], memory: Memory | None) -> list[CodeTransition]:
-    """Transitions whose codes end with the remembered values; ``begins`` tells which are the first of an episode."""
+    """Transitions whose codes end with the remembered values; codes that are not clear are not remembered.
+
+    ``begins`` tells which transitions are the first of an episode.
+    """
     if memory is None:
         return list(rows)
     found = []
     remembered = memory.hidden
     for row, first in zip(rows, begins, strict=True):
-        before = memory.after(memory.hidden if first else remembered, row.code)
-        remembered = memory.after(before, row.following)
+        before = memory.hidden if first else remembered
+        if row.code_is_clear:
+            before = memory.after(before, row.code)
+        remembered = memory.after(before, row.following) if row.following_is_clear else before
         found.append(row._replace(code=(*row.code, before), following=(*row.following, remembered)))
     return found
 

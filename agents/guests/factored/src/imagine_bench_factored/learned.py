@@ -119,11 +119,12 @@ class LearnedPerceptionAgent(CodeAgent):
 
     def _rows(self) -> list[CodeTransition]:
         """The replayed transitions, with the codes that its frames have now, as far as they are seen."""
-        codes, _, clear = self.perception.codes(np.stack(self.perception.frames))
+        codes = self.perception.codes(np.stack(self.perception.frames))
+        clear = codes.clear.tolist()
         rows = []
         for row, (before, after) in zip(self.replay, self.perception.transitions, strict=False):
-            is_clear = bool(clear[before] and clear[after])
-            rows.append(row._replace(code=codes[before], following=codes[after], is_clear=is_clear))
+            seen = row._replace(code=codes.values[before], following=codes.values[after])
+            rows.append(seen._replace(code_is_clear=clear[before], following_is_clear=clear[after]))
         return rows
 
     def perceived(self) -> Iterator[Perceived]:

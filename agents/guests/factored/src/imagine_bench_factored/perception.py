@@ -93,6 +93,15 @@ def _rows(codes: Codes, sizes: Sequence[int], *, factored: bool) -> list[Code]:
     return [tuple(row) for row in rows.tolist()]
 
 
+class FrameCodes(NamedTuple):
+    """The codes that N frames show, of P factors."""
+
+    values: list[Code]
+    known: Mask  #: whether the value of each factor was seen before. Shape (N, P).
+    #: False where a part of any factor's region is hidden and two of its values fit nearly equally well. Shape (N,).
+    clear: Mask
+
+
 class _ReadFrame(NamedTuple):
     """The code of a frame, whether all of its values are known, and whether they are clear."""
 
@@ -165,34 +174,35 @@ class LearnedPerception:
 
     def code(self, frame: Frame) -> Code:
         """The code of the newest frame (64, 64, 3) of an episode, with the memory of those before."""
-        code = self._read(frame).code
+        read = self._read(frame)
         if self.memory is None:
-            return code
-        self._remembered = self.memory.after(self._remembered, code)
-        return (*code, self._remembered)
+            return read.code
+        if read.is_clear:
+            self._remembered = self.memory.after(self._remembered, read.code)
+        return (*read.code, self._remembered)
 
     def is_clear(self, frame: Frame) -> bool:
-        """Whether each value of a frame fits clearly better than any other: not where too much is hidden."""
+        """False if a part of any factor's region is hidden and two of its values fit nearly equally well."""
         return self._read(frame).is_clear
 
     def _read(self, frame: Frame) -> _ReadFrame:
         """The code of a frame; the last ones are kept."""
         key = frame.tobytes()
         if key not in self._recent:
-            codes, known, clear = self.codes(frame[None])
-            self._recent[key] = _ReadFrame(codes[0], bool(known.all()), bool(clear[0]))
+            codes = self.codes(frame[None])
+            self._recent[key] = _ReadFrame(codes.values[0], bool(codes.known.all()), bool(codes.clear[0]))
             if len(self._recent) > _RECENT:
                 self._recent.pop(next(iter(self._recent)))
         return self._recent[key]
 
-    def codes(self, frames: Frame) -> tuple[list[Code], Mask, Mask]:
-        """The codes of frames (N, 64, 64, 3), which values are known, (N, P), and which codes are clear, (N,)."""
+    def codes(self, frames: Frame) -> FrameCodes:
+        """The codes of frames (N, 64, 64, 3), without memory; before factors are found all are alike and clear."""
         if not self.found:
-            return [(0,)] * len(frames), np.zeros((len(frames), 1), dtype=bool), np.ones(len(frames), dtype=bool)
+            known = np.zeros((len(frames), 1), dtype=bool)
+            return FrameCodes([(0,)] * len(frames), known, np.ones(len(frames), dtype=bool))
         read = appearance.read(self.found, self.frame_factors.standard.of(frames))
         codes = _rows(read.values, [len(factor.joint) for factor in self.found], factored=self._factored)
-        clear: Mask = np.logical_and.reduce(read.clear, axis=1)
-        return codes, read.known, clear
+        return FrameCodes(codes, read.known, np.asarray(read.clear.all(axis=1)))
 
     def remember(self, before: Frame, action: int, after: Frame, *, begins: bool = False) -> None:
         """Remember a transition; one that begins where the last one ended costs one frame."""

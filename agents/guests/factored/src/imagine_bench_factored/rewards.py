@@ -1,15 +1,16 @@
 """Rewards that chance changes, as a few classes: transitions of one class are worth the mean of their rewards.
 
 Rewards are exact unless most sightings of the same transition brought different ones, or hardly any reward came twice.
-Then the mean rewards of transitions are merged, the nearest ones first (Ward 1963), to the number of classes that the
-integrated classification likelihood prefers (Biernacki, Celeux & Govaert 2000). An end of an episode is a class of its
-own: where chance decides about ends, nothing is merged.
+Where hardly any transition was seen twice, small differences that no macro-action and value, nor two values, explain
+are noise, too. Then the mean rewards of transitions are merged, the nearest ones first (Ward 1963), to the number of
+classes that the integrated classification likelihood prefers (Biernacki, Celeux & Govaert 2000). An end of an episode
+is a class of its own: where chance decides about ends, nothing is merged.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import combinations_with_replacement, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -19,15 +20,22 @@ from imagine_bench.arrays import Floats, Ints
 from .factors import Code, CodeTransition
 
 _FEWEST = 8
-"""Rewards with an end, or without, that tell whether rewards come twice."""
+"""Rewards with an end, or without, that tell whether rewards come twice; pairs of rewards that tell whether two values
+explain them.
+"""
 _DIFFERENT = 0.5
 """Share of different ones among these above which rewards are noisy."""
 _PAIRS = 3
 """Pairs of sightings of one transition that tell how different its rewards are."""
 _MANY = 0.25
 """Share of these pairs that differ where a few amounts are drawn."""
+_TOLD = 16
+"""Fewest rewards that tell whether anything explains them; before, it is known whether any came twice."""
 _LITTLE = 0.1
 """Share of the range of all rewards that these differ by; by more, something that is not seen decides."""
+_NEAR = 0.25
+"""Share of this range within which rewards are compared if nothing was seen twice: it is small before a first success.
+"""
 _NORMAL = 0.954
 """Median of the absolute difference of two normal variables, in standard deviations."""
 _LEAST = 1e-6
@@ -72,8 +80,11 @@ def reward_classes(rows: Sequence[CodeTransition]) -> RewardClasses:
     sightings: dict[Key, list[float]] = {}
     for row in told:
         sightings.setdefault(_key(row), []).append(row.reward)
+    is_continuous = _is_continuous(told)
     noise = _noise(list(sightings.values()))
-    if noise == 0.0 and not _is_continuous(told):
+    if noise is None:
+        noise = 0.0 if is_continuous else _unexplained(told)
+    if noise == 0.0 and not is_continuous:
         return EXACT
     of_key: dict[Key, float] = {}
     centers: dict[bool, Floats] = {}
@@ -94,20 +105,50 @@ def _key(row: CodeTransition) -> Key:
     return row.code, row.action, row.following, row.terminated
 
 
-def _noise(sightings: Sequence[Sequence[float]]) -> float:
-    """Standard deviation of the rewards of one transition, as most have it; 0 where too few were seen again.
+def _noise(sightings: Sequence[Sequence[float]]) -> float | None:
+    """Standard deviation of the rewards of one transition, as most have it; None where too few were seen again.
 
     If not most of them differ, but many do by little, they have the noise that differs: a few amounts may come twice.
     """
-    apart = np.array([abs(one - other) for rewards in sightings for one, other in pairwise(rewards)])
+    apart = _apart(sightings)
     if len(apart) < _PAIRS:
-        return 0.0
+        return None
     differ = apart[apart > 0.0]
     most = float(np.median(apart))
     seen = [reward for rewards in sightings for reward in rewards]
     if most == 0.0 and len(differ) >= _MANY * len(apart) and np.median(differ) <= _LITTLE * np.ptp(seen):
         most = float(np.median(differ))
     return most / _NORMAL
+
+
+def _apart(sightings: Iterable[Sequence[float]]) -> Floats:
+    """How far the rewards of successive sightings are apart."""
+    return np.array([abs(one - other) for rewards in sightings for one, other in pairwise(rewards)])
+
+
+def _unexplained(rows: Sequence[CodeTransition]) -> float:
+    """Standard deviation of rewards of which many differ by little, whichever two values of a transition are the same.
+
+    Its values are those of the code, the macro-action, and those of the next code. 0 if any two of them, or one alone,
+    may explain the rewards. Two that are hardly ever the same again tell nothing, nor do large differences.
+    """
+    if len(rows) < _TOLD:
+        return 0.0
+    little = _NEAR * np.ptp([row.reward for row in rows])
+    values = np.array([(*row.code, row.action, *row.following) for row in rows])
+    found: list[float] = []
+    for pair in combinations_with_replacement(range(values.shape[1]), 2):
+        sightings: dict[tuple[int, ...], list[float]] = {}
+        for row, same in zip(rows, values[:, pair].tolist(), strict=True):
+            sightings.setdefault((*same, row.terminated), []).append(row.reward)
+        apart = _apart(sightings.values())
+        near = apart[apart <= little]
+        differ = near[near > 0.0]
+        if len(near) >= _FEWEST:
+            if len(differ) < _MANY * len(near):
+                return 0.0
+            found.append(float(np.median(differ)))
+    return float(np.median(found)) / _NORMAL if found else 0.0
 
 
 def _is_continuous(rows: Sequence[CodeTransition]) -> bool:

@@ -107,7 +107,7 @@ class SeeingWriter:
         """The codes that macrostates have by the present perception, each in new images."""
         found = {}
         for state in states_of(self._spec.rules):
-            codes, _, _ = self.perception.codes(self._drawn([state] * _IMAGES))
+            codes = self.perception.codes(self._drawn([state] * _IMAGES)).values
             found[state] = Counter(codes if self._hidden is None else (self._hidden.fill(code, None) for code in codes))
         return SeenCodes(found)
 
@@ -127,7 +127,7 @@ class SeeingWriter:
         frame_factors, found_in, sizes = before
         kept = self._codes
         known = self._explained(sizes)
-        codes, _, _ = self.perception.codes(np.stack(self._images))
+        codes = self.perception.codes(np.stack(self._images)).values
         self._codes = dict(enumerate(codes))
         found = self._explained(self.perception.sizes)
         if frame_factors.factors and self._is_clearer(known[1], found[1]):

@@ -49,7 +49,7 @@ class OwnCountTableAgent(CountTableAgent):
         self.table.clear()
         self._plans.clear()
         perception = self.perception
-        codes, _, _ = perception.codes(np.stack(perception.frames))
+        codes = perception.codes(np.stack(perception.frames)).values
         happened = zip(perception.transitions, perception.actions, self._happened, strict=False)
         for (before, after), action, (reward, terminated) in happened:
             self.table.add(codes[before][0], action, codes[after][0], reward, terminated)

@@ -78,7 +78,9 @@ class SeenValues(NamedTuple):
 
     values: Ints
     known: Mask  #: whether such a value was seen before
-    clear: Mask  #: whether no other value fits nearly as well, as one may where a part is hidden
+    #: False where a part of the region is hidden and an exemplar of another value is nearer than jitter makes two
+    #: crops of one value; of a factor, where that is so in any of its parts.
+    clear: Mask
 
 
 class Part(NamedTuple):
@@ -113,8 +115,7 @@ class SeenFactor(NamedTuple):
         found = _stacked([part.read(shapes if part.rests is None else still) for part in self.parts])
         wrong = (found.values[:, None] != self.joint).sum(axis=2)  # [N, K]
         known = found.known.all(axis=1) & (wrong.min(axis=1) == 0)
-        clear: Mask = np.logical_and.reduce(found.clear, axis=1)
-        return SeenValues(wrong.argmin(axis=1), known, clear)
+        return SeenValues(wrong.argmin(axis=1), known, np.asarray(found.clear.all(axis=1)))
 
 
 def _stacked(readings: Sequence[SeenValues]) -> SeenValues:
