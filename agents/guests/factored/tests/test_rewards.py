@@ -143,7 +143,7 @@ def test_a_resumed_run_classes_rewards_by_the_same_transitions(begins: int) -> N
             resumed = fake_codes.agent()
             resumed.restore(state)
             live_drawn(resumed, episode)
-            assert same(learner.state(), resumed.state())
+            assert same_state(learner.state(), resumed.state())
             resumptions += 1
     assert resumptions > 5
 
