@@ -53,6 +53,13 @@ def kept_from(folder: Path, kept: Path, joined: BenchResult | None = None) -> Pa
     return kept
 
 
+def test_benches_without_a_common_seed_are_refused_with_the_seeds_of_each_agent(tmp_path: Path) -> None:
+    first = do(tmp_path, "oracle", seeds=(0, 1), budgets=(4, 9))
+    second = do(tmp_path, "random", seeds=(2,), budgets=(4, 9))
+    with pytest.raises(ArtefactError, match=r"No seed of the benches .* to 4 .*: oracle has 0 1; random has 2\. Run"):
+        load_merged([first, second], tmp_path)
+
+
 def test_every_run_of_both_is_there_unchanged(tmp_path: Path) -> None:
     first = do(tmp_path, "oracle", seeds=(0, 1), budgets=(4, 9))
     second = do(tmp_path, "random", seeds=(1, 2), budgets=(2, 4, 9))
