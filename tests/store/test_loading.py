@@ -82,7 +82,7 @@ def test_every_run_of_both_is_there_unchanged(tmp_path: Path) -> None:
         (("oracle",), {}, InvalidValueError, "have the same seed of the same agent"),
         (("random",), {"appearance": "mild"}, InvalidValueError, "has appearance 'mild' where .* has 'clean'"),
         (("random",), {"encoder": "x@0123456789ab"}, InvalidValueError, "has encoder 'x@.*' where .* has 'a@"),
-        (("random",), {"seeds": (5,)}, ArtefactError, "No seed of this bench"),
+        (("random",), {"seeds": (5,)}, ArtefactError, "No seed of the benches"),
         (("random",), {"budgets": (3,)}, InvalidValueError, "No budget is in all of the benches"),
         (("oracle",), {"seeds": (5,), "settings_digest": "one"}, InvalidValueError, "has settings_digest 'one'"),
     ],
