@@ -261,6 +261,10 @@ class Play:
         """Play, or film."""
         from imagine_bench.tools import play  # noqa: PLC0415 - pillow loads slowly
 
+        motion = None if self.task is None else registry.task_of_motion(self.task)
+        if motion is not None:
+            self._play_motion(motion)
+            return
         if self.quiz:
             self._quiz()
             return
@@ -270,14 +274,6 @@ class Play:
         require_with("--keep", self, "tests", "training", "like")
         if not self.film:
             require_with("--film or --keep", self, "out")
-            motion = None if self.task is None else registry.task_of_motion(self.task)
-            if motion is not None:
-                require_with("a task of macro-actions", self, "model", "execution", "encoder")
-                look = self.appearance or APPEARANCES[0]
-                registry.require_guest(registry.MOTION, "Playing continuous control by keys")
-                play_motion = registry.load("imagine_bench_motion.control.keyboard:play_motion")
-                print(play_motion(motion, seed=self.seed, appearance=look, camera=self.camera))
-                return
             options = {"execution": self.execution, "appearance": self.appearance, "encoder": self.encoder}
             print(play.play(self.task, model=self.model, seed=self.seed, camera=self.camera, **options))
             return
@@ -288,6 +284,14 @@ class Play:
             )
         look = self.appearance or APPEARANCES[0]
         print(play.film(self.task, self.out or Path("film.gif"), seed=self.seed, appearance=look, camera=self.camera))
+
+    def _play_motion(self, task: str) -> None:
+        others = ("quiz", "keep", "tests", "training", "like", "film", "out", "model", "execution", "encoder")
+        require_with("a task of macro-actions", self, *others)
+        registry.require_guest(registry.MOTION, "Playing continuous control by keys")
+        play_motion = registry.load("imagine_bench_motion.control.keyboard:play_motion")
+        look = self.appearance or APPEARANCES[0]
+        print(play_motion(task, seed=self.seed, appearance=look, camera=self.camera))
 
     def _keep(self, name: str) -> None:
         from imagine_bench.tools import play  # noqa: PLC0415 - as above

@@ -118,7 +118,10 @@ def _readme(card: Mapping[str, Json]) -> str:
     if format == "lerobot":
         head["configs"] = [{"config_name": "default", "data_files": "data/*/*.parquet"}]
     yaml = "\n".join(f"{name}: {json.dumps(value)}" for name, value in head.items())
-    facts = "\n".join(f"| {name.replace('_', ' ')} | {card[name]} |" for name in _SHOWN if name in card)
+    known = {name: card[name] for name in _SHOWN if name in card}
+    if "appearance" in known:
+        known["appearance"] = appearance_typed(str(known["appearance"]))
+    facts = "\n".join(f"| {name.replace('_', ' ')} | {value} |" for name, value in known.items())
     return f"""---
 {yaml}
 ---

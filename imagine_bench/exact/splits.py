@@ -94,6 +94,13 @@ def split_of(rules: Rules, text: str) -> Split:
     return found
 
 
+def _counted(rules: Rules, *coordinates: int) -> tuple[State, ...]:
+    """The starts. IndexError: a coordinate is counted from the end, so that one split would have two names."""
+    if min(coordinates) < 0:
+        raise IndexError(min(coordinates))
+    return rules.start_states
+
+
 def _by_plan_length(rules: Rules, longest: int) -> _IsTest:
     tables = tabulate(rules)
     lengths = dict(zip(rules.start_states, shortest_plans(tables)[tables.starts].tolist(), strict=True))
@@ -101,12 +108,17 @@ def _by_plan_length(rules: Rules, longest: int) -> _IsTest:
 
 
 def _by_values(rules: Rules, coordinate: int, *values: int) -> _IsTest:
-    del rules
+    known = {state[coordinate] for state in _counted(rules, coordinate)}
+    for value in values:
+        if value not in known:
+            raise InvalidValueError(
+                f"No start has the value {value} of coordinate {coordinate}; give some of {sorted(known)}."
+            )
     return lambda state: state[coordinate] in values
 
 
 def _by_pairs(rules: Rules, first: int, second: int, held_out: int) -> _IsTest:
-    found = sorted({(state[first], state[second]) for state in rules.start_states})
+    found = sorted({(state[first], state[second]) for state in _counted(rules, first, second)})
     trained = list(found)
     rng = np.random.default_rng(0)
     for index in rng.permutation(len(found)).tolist():

@@ -14,7 +14,7 @@ import numpy as np
 from tqdm import tqdm
 
 from imagine_bench import registry, statistics
-from imagine_bench.appearance import appearance_name
+from imagine_bench.appearance import appearance_name, appearance_typed
 from imagine_bench.arrays import Arrays, Info, State
 from imagine_bench.data.folder import Apart, Dataset, read_apart
 from imagine_bench.errors import InvalidValueError, UnknownNameError
@@ -197,7 +197,7 @@ def describe(dataset: Dataset) -> str:
     else:
         apart = [f"{name}.npz ({', '.join(arrays)})" for name, arrays in read_apart(dataset).items()]
         lines |= {
-            "task": f"{card['task']}, {card['execution']} execution, appearance {card['appearance']}",
+            "task": f"{card['task']}, {card['execution']} execution, appearance {appearance_typed(card['appearance'])}",
             "policy": f"{card['policy']} ({card['played']}), seed {card['seed']}",
             "exact": f"chance {card['chance_level']:.1%}; if all is seen, optimum {card['optimum']:.1%} and "
             f"optimal return {card['optimal_return']:.2f}",

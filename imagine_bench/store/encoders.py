@@ -91,7 +91,7 @@ def offered(spec: TaskSpec, appearance: str, name: str) -> Path:
         ) from error
     known = f"{entry.make}/{spec.preprocessing}/".encode() + np.round(features, 3).tobytes()
     path = _place(known, f"{name}-{file_name(spec.id)}-{appearance}")
-    what = f"The scale and the probe of {name} for {spec.id} at {appearance} are made"
+    what = f"The scale and the probe of {name} for {spec.id} at {appearance_typed(appearance)} are made"
     _once(path, what, lambda: registry.load(_FIT)(spec, name=name, offer=entry.make, appearance=appearance, path=path))
     return path
 

@@ -20,6 +20,7 @@ from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import digest
 from imagine_bench.registry.entries import agent_label, file_name
+from imagine_bench.seeding import seeds_text
 from imagine_bench.store import run_folder
 from imagine_bench.store.bench_folder import KEPT, BenchStore, bench_facts, is_archive, read_control
 from imagine_bench.store.files import json_text, reading, table_rows, table_text
@@ -204,7 +205,15 @@ def merge(results: Sequence[BenchResult], root: Path) -> BenchResult:
             "Several of the benches have the same seed of the same agent; give benches of different agents, or of "
             "different seeds of the same agents."
         )
-    part = _largest_table(protocol, _reached(protocol, runs))
+    try:
+        part = _largest_table(protocol, _reached(protocol, runs))
+    except ArtefactError as error:
+        seeds = {agent: seeds_text(sorted(seed for other, seed in runs if other == agent)) for agent in protocol.agents}
+        raise ArtefactError(
+            f"No seed of the benches that are merged has brought every agent to {protocol.budgets[0]} real episodes: "
+            f"{'; '.join(f'{agent} has {its}' for agent, its in seeds.items())}. Run the seeds that an agent lacks, or "
+            "leave its bench out."
+        ) from error
     commands = "; ".join(str(result.environment.get("command", "")) for result in results)
     benches = {f"bench {number}": dict(result.environment) for number, result in enumerate(results, start=1)}
     missing = tuple(sentence for result in results for sentence in result.missing)

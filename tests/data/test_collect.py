@@ -13,9 +13,10 @@ from bench_fakes import TableAgent
 from small_runs import Inline, collected, do, small
 
 from imagine_bench import registry
+from imagine_bench.appearance import appearance_name
 from imagine_bench.arrays import Frame, Info
 from imagine_bench.cli import exit_code as main
-from imagine_bench.data.folder import read_dataset
+from imagine_bench.data.folder import read_dataset, write_dataset
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Observation
 from imagine_bench.running.collect import collect, describe, policy_of
@@ -141,6 +142,16 @@ def test_the_command_collects_and_describes(tmp_path: Path, capsys: pytest.Captu
     assert describe(read_dataset(out)) in said and "100.0% of episodes [34.2%" in said and "chance 4.6%" in said
     assert main([*words, "--out", str(out)]) == 2
     assert f"{out} exists; give another folder with --out. Nothing was written." in capsys.readouterr().err
+
+
+def test_a_dataset_has_the_appearance_that_people_type(tmp_path: Path) -> None:
+    episodes, apart, card = collected()
+    stored = {**card, "appearance": appearance_name("patched")}
+    found = write_dataset(tmp_path / "set", episodes, apart, stored, "npz")
+    assert "kinematic execution, appearance patched\n" in describe(found)
+    page = (tmp_path / "set" / "README.md").read_text()
+    assert "| appearance | patched |" in page and "photo" not in page
+    assert found.card is not None and found.card["appearance"] == "photo", "as files hold it"
 
 
 def test_standard_sets_are_of_three_strengths_and_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -53,7 +53,18 @@ def test_a_split_is_known_by_its_content():
     fewer = (dataclasses.replace(split, train=split.train[1:]), dataclasses.replace(split, test=split.test[1:]))
     assert len({split.hash, *(each.hash for each in fewer)}) == 3
     with pytest.raises(InvalidValueError, match="leaves no start for test"):
-        split_of(RULES, "values=3:9")
+        split_of(RULES, "plan_length=99")
+
+
+def test_a_split_has_no_second_name_and_names_no_value_that_no_start_has():
+    for wrong in ("values=-1:2", "pairs=0:-1:2", "pairs=-4:3:2"):
+        with pytest.raises(InvalidValueError, match="names no split of"):
+            split_of(RULES, wrong)
+    for wrong in ("values=3:9", "values=3:2:9", "values=3:-1"):
+        with pytest.raises(
+            InvalidValueError, match=r"^No start has the value (9|-1) of coordinate 3; .* \[0, 1, 2\]\.$"
+        ):
+            split_of(RULES, wrong)
 
 
 def test_rules_with_fewer_starts_are_copied_and_pickled_and_are_the_rules_in_all_else():

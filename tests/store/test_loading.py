@@ -53,6 +53,13 @@ def kept_from(folder: Path, kept: Path, joined: BenchResult | None = None) -> Pa
     return kept
 
 
+def test_benches_without_a_common_seed_are_refused_with_the_seeds_of_each_agent(tmp_path: Path) -> None:
+    first = do(tmp_path, "oracle", seeds=(0, 1), budgets=(4, 9))
+    second = do(tmp_path, "random", seeds=(2,), budgets=(4, 9))
+    with pytest.raises(ArtefactError, match=r"No seed of the benches .* to 4 .*: oracle has 0 1; random has 2\. Run"):
+        load_merged([first, second], tmp_path)
+
+
 def test_every_run_of_both_is_there_unchanged(tmp_path: Path) -> None:
     first = do(tmp_path, "oracle", seeds=(0, 1), budgets=(4, 9))
     second = do(tmp_path, "random", seeds=(1, 2), budgets=(2, 4, 9))
@@ -75,7 +82,7 @@ def test_every_run_of_both_is_there_unchanged(tmp_path: Path) -> None:
         (("oracle",), {}, InvalidValueError, "have the same seed of the same agent"),
         (("random",), {"appearance": "mild"}, InvalidValueError, "has appearance 'mild' where .* has 'clean'"),
         (("random",), {"encoder": "x@0123456789ab"}, InvalidValueError, "has encoder 'x@.*' where .* has 'a@"),
-        (("random",), {"seeds": (5,)}, ArtefactError, "No seed of this bench"),
+        (("random",), {"seeds": (5,)}, ArtefactError, "No seed of the benches"),
         (("random",), {"budgets": (3,)}, InvalidValueError, "No budget is in all of the benches"),
         (("oracle",), {"seeds": (5,), "settings_digest": "one"}, InvalidValueError, "has settings_digest 'one'"),
     ],

@@ -280,8 +280,12 @@ def test_keyboard_events_move_the_hand(keyboard, capsys):
     keyboard("wgf")
     assert main(["play", "ArrowPuzzleEasyMotion", "--seed", "5"]) == 0
     assert capsys.readouterr().out == "No episode was finished.\n"
-    assert main(["play", "ArrowPuzzleMotion", "--execution", "kinematic"]) == 2
-    assert "--execution goes with a task of macro-actions" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--execution kinematic", "--film", "--quiz 3", "--keep anna", "--out x.gif"])
+def test_continuous_control_is_told_which_options_it_does_not_take(option, capsys):
+    assert main(["play", "ArrowPuzzleMotion", *option.split()]) == 2
+    assert f"{option.split()[0]} goes with a task of macro-actions" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from imagine_bench_programs import __main__ as commands
-from imagine_bench_programs.experience import play, write_experience
+from imagine_bench_programs.experience import macro_actions_of, play, write_experience
 from imagine_bench_programs.model import make_program
 from imagine_bench_programs.program import Program, spelled
 from imagine_bench_programs.scores import efficiency, score
@@ -104,6 +104,16 @@ def test_the_example_is_exact_and_misses_slips_by_their_probability(program: Pro
     assert slips.total_variation == pytest.approx(0.2, abs=1e-12)
     assert slips.ranking == pytest.approx(0.8) and slips.fidelity == pytest.approx(0.95)
     assert slips.facts == 39 and slips.found == 39 - 6 * 4, "each macro-action turns one cube, from four directions"
+
+
+def test_experience_of_another_task_gives_no_efficiency(tmp_path: Path) -> None:
+    for task in ("arrow_puzzle", "arrows:slip=0.5", "pick_place", "arrows:gesture=first"):
+        folder = tmp_path / task
+        write_experience(task, folder, macro_actions=30, seed=0)
+        assert macro_actions_of(folder, registry.task(task)) == 30
+    for task in ("arrows:slip=0.5", "pick_place"):
+        with pytest.raises(InvalidValueError, match=r"holds experience that arrow_puzzle cannot give"):
+            macro_actions_of(tmp_path / task, registry.task("arrow_puzzle"))
 
 
 def test_efficiency_is_a_square_and_at_most_one() -> None:

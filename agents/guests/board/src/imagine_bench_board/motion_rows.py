@@ -15,7 +15,7 @@ import gymnasium
 import numpy as np
 
 from imagine_bench import registry
-from imagine_bench.appearance import appearance_name
+from imagine_bench.appearance import appearance_name, appearance_typed
 from imagine_bench.arrays import Floats32
 from imagine_bench.errors import InvalidValueError, brief, require
 from imagine_bench.protocols.data import require_types
@@ -72,7 +72,7 @@ class MotionProtocol:
     def world(self) -> str:
         """The world in words."""
         off = f", objects up to {100 * self.placement:g} cm off their slots" if self.placement else ""
-        return f"{self.task}, continuous control at 25 Hz, {self.appearance}{off}"
+        return f"{self.task}, continuous control at 25 Hz, {appearance_typed(self.appearance)}{off}"
 
 
 @dataclass(frozen=True, kw_only=True)

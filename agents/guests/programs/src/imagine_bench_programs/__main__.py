@@ -67,7 +67,7 @@ def _add_score(parser: argparse.ArgumentParser) -> None:
 def _score(given: argparse.Namespace) -> None:
     spec = task(given.task)
     program = Program(given.file, [len(values) for values in spec.macrostate_values], spec.n_actions)
-    macro_actions = None if given.experience is None else macro_actions_of(given.experience)
+    macro_actions = None if given.experience is None else macro_actions_of(given.experience, spec)
     print(_words(spec, score(program, spec), macro_actions))
 
 

@@ -95,9 +95,21 @@ def write_experience(task_name: str, folder: Path, *, macro_actions: int, seed: 
         (folder / name).write_text(text)
 
 
-def macro_actions_of(folder: Path) -> int:
-    """The macro-actions behind a folder of experience. Raises InvalidValueError: it is none."""
+def macro_actions_of(folder: Path, spec: TaskSpec) -> int:
+    """The macro-actions behind a folder of experience. Raises InvalidValueError: it is none, or of another task."""
     try:
-        return int(json.loads((folder / _FILE).read_text())["macro_actions"])
+        known = json.loads((folder / _FILE).read_text())
+        count = int(known["macro_actions"])
+        fits = [*known["factors"], known["actions"]] == [*map(len, spec.macrostate_values), spec.n_actions]
+        if fits and spec.sight is None:
+            fits = all(_can_happen(spec, *row[:5]) for row in known["transitions"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InvalidValueError(f"{folder} holds no experience ({error}); give a folder of 'experience'.") from error
+    if not fits:
+        raise InvalidValueError(f"{folder} holds experience that {spec.id} cannot give; give that of this task.")
+    return count
+
+
+def _can_happen(spec: TaskSpec, now: list[int], action: int, then: list[int], reward: float, ended: bool) -> bool:
+    outcomes = spec.rules.outcomes(tuple(now), action)
+    return (tuple(then), reward, ended) in [(each.macrostate, each.reward, each.terminated) for each in outcomes]

@@ -19,7 +19,7 @@ from imagine_bench.tasks.world import World
 from tqdm import tqdm
 
 from imagine_bench import registry, statistics
-from imagine_bench.appearance import appearance_name
+from imagine_bench.appearance import appearance_name, appearance_typed
 from imagine_bench.arrays import Array, Arrays, Info, Observed
 from imagine_bench.data.folder import FORMATS, new_folder, read_files, write_card
 from imagine_bench.data.motion import CAMERAS, OBSERVATIONS, OUTCOMES, Demonstrations, Digest
@@ -350,7 +350,7 @@ def describe(kept: Demonstrations) -> str:
         "success": f"{card['successes'] / episodes:.1%} of episodes [{low:.1%}, {high:.1%}]",
         "return": f"{card['mean_return']:.2f} an episode; optimum {card['optimal_return']:.2f} if all is seen",
         "content": card["content"],
-        "task": f"{card['env_id']}, control {card['control']}, appearance {card['appearance']}",
+        "task": f"{card['env_id']}, control {card['control']}, appearance {appearance_typed(card['appearance'])}",
         "images": f"{' and '.join(CAMERAS)}, {card['size']} pixels",
         "policy": f"{card['policy']} ({card['played']}), seed {card['seed']}",
         "apart": "privileged.npz (seeds, macrostates): never given to a learner",
