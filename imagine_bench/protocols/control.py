@@ -476,7 +476,8 @@ def context_of(spec: RunSpec[Protocol]) -> AgentContext:
     world = task(protocol.task)
     size = (protocol.observation_size, protocol.observation_size, 3)
     shapes = {"state": (sum(map(len, world.macrostate_values)),), "proprio": (PROPRIO_SIZE,)}
-    is_only_world = entry.privileged and not (entry.learns and protocol.after)  # the earlier tasks have other rules
+    others = protocol.after or protocol.feedback  # tasks of other rules, or rewards of a teacher
+    is_only_world = entry.privileged and not (entry.learns and others)
     return AgentContext(
         n_actions=world.n_actions,
         preprocessing=world.preprocessing,

@@ -55,7 +55,8 @@ def plan_control(
     rests_on_others = any(map(_rests_on_others, whole.agents))
     if found is not None:
         paths = {**paths, "dataset": found.folder.resolve()}
-    if encoder or whole.dataset or whole.after or whole.demonstrations or whole.queries or rests_on_others:
+    asks = whole.dataset or whole.after or whole.demonstrations or whole.queries or whole.feedback
+    if encoder or asks or rests_on_others:
         _check_abilities(whole, paths)
     return whole, paths
 

@@ -131,11 +131,12 @@ def test_only_who_is_given_the_world_imagines_exactly() -> None:
 
 
 @pytest.mark.parametrize("agent", ["imagination_exact", "imagination_exact_filter"])
-def test_the_rules_of_a_task_are_not_taken_for_those_of_the_tasks_before_it(agent: str) -> None:
+def test_rules_are_given_where_all_rewards_of_training_are_theirs(agent: str) -> None:
+    """Earlier tasks have other rules, and a teacher's feedback is in no rule."""
     before = {"after": ("arrow_puzzle_hard",), "unannounced": True}
     given = [
         context_of(RunSpec(protocol=protocol("arrow_puzzle", "smoke", agents=(agent,), **more), agent=agent, seed=0))
-        for more in ({}, before)
+        for more in ({}, before, {"feedback": 2.0})
     ]
     assert given[0].exact_world is not None
-    assert given[1].exact_world is None
+    assert given[1].exact_world is given[2].exact_world is None
