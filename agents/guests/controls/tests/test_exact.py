@@ -19,6 +19,7 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import ExactWorld, Outcome, Transition
 from imagine_bench.protocols.control import context_of, protocol
 from imagine_bench.protocols.data import RunSpec
+from imagine_bench.running.bench import plan
 
 STATES = 6
 GOAL = 5
@@ -120,6 +121,55 @@ def test_the_exact_filter_keeps_what_is_right() -> None:
     step = ImaginedStep(CODES[reached] + 0.01, torch.tensor(reward), torch.tensor(ends), None, None)  # type: ignore[arg-type]
     z = CODES[[4] * len(rows)] - 0.01
     assert agent.imagination.admits(z, torch.tensor(action), step, 0.0).tolist() == right
+
+
+OTHERS: dict[str, Any] = {
+    "model.members": 3,
+    "imagination.temperature": 0.5,
+    "imagination.predicts_with": "network",
+    "imagination.curiosity": 0.5,
+    "imagination.weight_samples": 9,
+    "imagination.reduction": "sum",
+    "imagination.accumulates": True,
+    "imagination.confidence_scale": 0.2,
+    "imagination.threshold": 0.1,
+    "imagination.threshold_quantile": 0.5,
+    "imagination.reward_threshold": 0.1,
+    "imagination.termination_threshold": 0.1,
+    "imagination.model_only_episodes": 5,
+    "imagination.start_episode": 3,
+    "imagination.end_episode": 5,
+    "imagination.start_states": "replayed",
+    "imagination.breadth": 5,
+    "imagination.depth": 2,
+    "imagination.updates_per_step": 2,
+    "imagination.exploration": 1.0,
+    "memory.imagined": 7,
+    "memory.priority": 0.5,
+}
+
+
+def learned_with(**settings: Any) -> dict[str, bytes]:
+    agent = built(exact.make, settings, exact_world=WORLD)
+    live(agent, 8)
+    return {name: array.tobytes() for name, array in agent.state().arrays.items()}
+
+
+@pytest.mark.parametrize("setting", OTHERS)
+def test_a_setting_of_a_learned_model_has_no_effect_on_the_exact_one(setting: str) -> None:
+    """And a bench refuses it, as each other setting without effect."""
+    same = learned_with(**{setting: OTHERS[setting]}) == learned_with()
+    assert same == (setting in registry.inert_settings("imagination_exact"))
+
+
+def test_a_bench_refuses_settings_that_do_nothing_for_a_control() -> None:
+    inert = registry.inert_settings
+    assert {"imagination.threshold", "imagination.model_only_episodes"} <= inert("imagination_exact_filter")
+    assert "imagination.confidence_scale" not in inert("imagination_exact_filter")
+    assert "imagination.model_only_episodes" in inert("imagination_memory")
+    assert "imagination.threshold" not in inert("imagination_memory")
+    with pytest.raises(InvalidValueError, match="model.members has no effect on agent imagination_exact"):
+        plan("arrow_puzzle", "smoke", agents=("imagination_exact:model.members=5",))
 
 
 def test_only_who_is_given_the_world_imagines_exactly() -> None:

@@ -28,14 +28,14 @@ IMAGINATION_MEMORY = AgentEntry(
 )
 IMAGINATION_EXACT = AgentEntry(
     make="imagine_bench_controls.exact:make",
-    settings="imagine_bench.agents.imagination.settings:HYPERPARAMETERS",
+    settings="imagine_bench.agents.imagination.inert:KNOWING",
     privileged=True,
     title="imagination, exact model",
     description="A control (privileged): like imagination, with the rules and rendered frames for its world model.",
 )
 IMAGINATION_EXACT_FILTER = AgentEntry(
     make="imagine_bench_controls.exact:make_filter",
-    settings="imagine_bench.agents.imagination.settings:HYPERPARAMETERS",
+    settings="imagine_bench.agents.imagination.inert:UNFILTERED",
     privileged=True,
     title="imagination, exact filter",
     description="A control (privileged): like imagination, but it learns only from imagined transitions that are "
