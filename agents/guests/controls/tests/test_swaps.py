@@ -120,5 +120,5 @@ def test_priorities_do_not_change_swaps() -> None:
         live(learner, 5)
         states.append({name: array.tobytes() for name, array in learner.state().arrays.items()})
     assert states[0] == states[1]
-    with pytest.raises(InvalidValueError, match="memory.priority has no effect on agent dqn_swaps"):
+    with pytest.raises(InvalidValueError, match=r"memory\.priority has no effect on agent dqn_swaps"):
         plan("arrow_puzzle", "smoke", agents=("dqn_swaps:memory.priority=1",))
