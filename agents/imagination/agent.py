@@ -103,6 +103,10 @@ class ImaginingAgent(DQN):
         self.meters.add("imagination/intrinsic_reward", float(paid.mean()))
         return replace(batch, reward=batch.reward + paid)
 
+    def remembered_states(self) -> Tensor:
+        """The states that it remembers to have acted in, as means of their latents. Shape (N, Z)."""
+        return torch.from_numpy(self.real.arrays()["mu"].astype(np.float32))
+
     def _imagine(self, z: Tensor) -> None:
         with self.meters.cpu_time("time/imagination_s"):
             chance = epsilon(self.steps, self.settings.controller)

@@ -162,5 +162,5 @@ def imagined_env(
     Episodes start at ``frames`` (P, 64, 64, 3) or, without, in all states that the agent remembers to have acted in, as
     means of their latents; otherwise as :class:`ImaginedVectorEnv`.
     """
-    starts = agent.real.arrays()["mu"] if frames is None else agent.perception.encoder.encode(frames)[0].cpu().numpy()
-    return ImaginedVectorEnv(agent.imagination, starts.astype(np.float32), num_envs=num_envs, horizon=horizon)
+    starts = agent.remembered_states() if frames is None else agent.perception.encoder.encode(frames)[0]
+    return ImaginedVectorEnv(agent.imagination, starts.cpu().numpy(), num_envs=num_envs, horizon=horizon)

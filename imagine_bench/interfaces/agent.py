@@ -61,7 +61,8 @@ class AgentContext:
     #: makes an optimal policy, from the observation and so many macro-actions of an episode; only
     #: for agents registered as privileged, None for every other
     optimal_policy: Callable[[], Callable[[State, int], int]] | None = None
-    #: only for agents registered as privileged, where frames hide nothing and no other task is trained on before
+    #: only for agents registered as privileged, where frames hide nothing, no other task is trained on before, and no
+    #: teacher adds to rewards
     exact_world: ExactWorld | None = None
     argument: str = ""  #: the text after the colon of the name that it was asked for by
     #: shape of each part of an observation, by its name in :data:`OBSERVATIONS`

@@ -173,8 +173,9 @@ class ModelSource:
         """
         if self.encoder is None:
             return {"encoder": "", "encoder_frames": 0}
-        frames = encoders.card_of(self.encoder).get("recipe", {}).get("frames", 0)
-        share = encoders.low_share(self.encoder)
+        card = encoders.card_of(self.encoder)
+        frames = card.get("recipe", {}).get("frames", 0)
+        share = encoders.low_share(card)
         low = {} if share is None else {"encoder_reads": share}
         return {"encoder": self.encoder.stem, "encoder_frames": frames, **low}
 

@@ -474,6 +474,11 @@ def _require_exact_world(agent: str, wanted: Protocol) -> None:
             f"Agent {agent!r} is given the exact rules of one task, and here another comes before; leave --after out, "
             "or that agent."
         )
+    if wanted.feedback:
+        raise UnableError(
+            f"Agent {agent!r} is given the exact rules of one task, and here a teacher adds to rewards; leave --feedback "
+            "out, or that agent."
+        )
 
 
 _OF_WORLDS = {
@@ -507,7 +512,8 @@ def context_of(spec: RunSpec[Protocol]) -> AgentContext:
     world = task(protocol.task)
     size = (protocol.observation_size, protocol.observation_size, 3)
     shapes = {"state": (sum(map(len, world.macrostate_values)),), "proprio": (PROPRIO_SIZE,)}
-    is_only_world = entry.privileged and not (entry.learns and protocol.after)  # the earlier tasks have other rules
+    others = protocol.after or protocol.feedback  # tasks of other rules, or rewards of a teacher
+    is_only_world = entry.privileged and not (entry.learns and others)
     return AgentContext(
         n_actions=world.n_actions,
         preprocessing=world.preprocessing,

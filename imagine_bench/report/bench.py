@@ -10,7 +10,6 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -27,7 +26,9 @@ from imagine_bench.report.data import (
     SCORE,
     Record,
     ReportData,
+    card_of,
     collect,
+    encoder_of,
     estimated,
     frames_before,
     known_agent,
@@ -218,16 +219,9 @@ def _amiss(data: ReportData) -> Iterator[str]:
     if absent:
         yield f"Not installed here: {', '.join(absent)}. Numbers that need missing code are not shown."
     for agent in part.agents:
-        words = encoders.reading_warning(_encoder(data, agent))
+        words = encoders.reading_warning((encoder_of(data, agent) or "").partition("@")[0], card_of(data, agent))
         if words:
             yield f"“{agent}” sees through {words}."
-
-
-def _encoder(data: ReportData, agent: str) -> Path | None:
-    """The encoder that an agent sees through, where it is here."""
-    entry = known_agent(agent)
-    used = data.result.protocol.encoder_of(entry.encoder_kind) if entry.make and entry.needs_encoder else None
-    return None if used is None else encoders.find(used)
 
 
 # Tables ------------------------------------------------------------------------------------------------------------
@@ -262,7 +256,7 @@ def _scores(data: ReportData, budgets: Sequence[int], *, short: bool = False) ->
     cell = _in_short if short else _solved
     rows: list[tuple[str, Mapping[int, str]]] = []
     for agent in data.result.protocol.agents:
-        title = agent + encoders.mark(encoders.low_share(_encoder(data, agent)))
+        title = agent + encoders.mark(encoders.low_share(card_of(data, agent)))
         rows.append((title, {each["episodes"]: cell(data, each) for each in data.of(agent)}))
         if not short and not data.thesis[agent].keys().isdisjoint(budgets):
             cells = {budget: _mean_std(*each) for budget, each in data.thesis[agent].items()}
@@ -398,7 +392,7 @@ def cost(data: ReportData) -> Section:
         "Frames before training are drawn from all macrostates alike. A fault is a macro-action whose physical outcome "
         f"was not as the rules say. The whole bench took {data.result.wall_s:,.0f} s of wall time."
     )
-    table = Table.of("cost", rows, caption, "not counted by the agent, or an encoder that is not bundled")
+    table = Table.of("cost", rows, caption, "not counted by the agent, or an encoder of which no card is here")
     return Section("Costs and faults", tables=[table])
 
 

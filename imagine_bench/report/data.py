@@ -202,12 +202,27 @@ def mean(values: Iterable[float]) -> float:
     return float(np.mean(known)) if known else math.nan
 
 
+def encoder_of(data: ReportData, agent: str) -> str | None:
+    """The identity of the encoder that an agent sees through."""
+    entry = known_agent(agent)
+    return data.result.protocol.encoder_of(entry.encoder_kind) if entry.make and entry.needs_encoder else None
+
+
+def card_of(data: ReportData, agent: str) -> Record | None:
+    """The card of the encoder that an agent sees through, also of one's own file, which is kept with the bench."""
+    used = encoder_of(data, agent)
+    facts: Any = data.result.environment
+    merged = [each for name, each in facts.items() if name.startswith("bench ")]
+    kept = [cards[used] for each in (facts, *merged) if used in (cards := each.get("encoders", {}))]
+    return encoders.card(used) or next(iter(kept), None)
+
+
 def frames_before(data: ReportData, agent: str) -> float:
     """Frames that an agent's encoder was trained on, by its card; 0 without an encoder, NaN where not known."""
     entry = known_agent(agent)
     if entry.make and not entry.needs_encoder:
         return 0
-    card = encoders.card(data.result.protocol.encoder_of(entry.encoder_kind)) if entry.make else None
+    card = card_of(data, agent)
     return math.nan if card is None or card.get("offer") else int(card["recipe"]["frames"])
 
 

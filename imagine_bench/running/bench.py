@@ -342,8 +342,10 @@ def carry_out(
         if any(task_type(store.protocol.task).draws for store, _ in work):
             gl_renderer()  # fails here, in one sentence, rather than in every run
         environment = describe_environment() if work else {}
-        for store, _ in work:
-            _warn(store.begin_session(environment, certificate_of), store.folder)
+        for store, paths in work:
+            used = {encoders.identity(path): encoders.short_card(path) for path in _artefacts([paths])}
+            facts = {**environment, "encoders": used} if used else environment
+            _warn(store.begin_session(facts, certificate_of), store.folder)
             held.callback(store.save_time)
         jobs = [job for store, paths in work for job in _jobs(store, paths)]
         with ProgressBar([job.spec for job in jobs]) as show:
@@ -361,9 +363,15 @@ def _say_other_code(folder: Path, wanted: ProtocolData) -> None:
 
 def _say_doubts(needed: Iterable[Encoders]) -> None:
     """Say of each encoder once, through which agents see, if few frames are read right from it."""
-    artefacts = {path for paths in needed for kind, path in paths.items() if kind != "dataset" and path is not None}
-    for words in filter(None, map(encoders.reading_warning, sorted(artefacts))):
-        print(f"Note: agents see through {words}.")
+    for path in _artefacts(needed):
+        words = encoders.reading_warning(path.stem, encoders.card_of(path))
+        if words:
+            print(f"Note: agents see through {words}.")
+
+
+def _artefacts(needed: Iterable[Encoders]) -> list[Path]:
+    """The files of encoders, each once."""
+    return sorted({path for paths in needed for kind, path in paths.items() if kind != "dataset" and path is not None})
 
 
 @functools.cache

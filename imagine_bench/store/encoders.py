@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from imagine_bench.interfaces import APPEARANCES, Frame, TaskSpec, bundled_name
 from imagine_bench.registry.entries import file_name
 from imagine_bench.rules import states_of
 from imagine_bench.store.files import expanded, lock, make_folder, reading, sha256
+from imagine_bench.values import Json
 
 TRAIN = "imagine_bench.agents.encoders.cli:retrain"
 _FIT = "imagine_bench.agents.encoders.training:fit_offered"
@@ -178,12 +179,12 @@ def card(used: str | None) -> dict[str, Any] | None:
     return None if path is None else card_of(path)
 
 
-def low_share(path: Path | None) -> float | None:
-    """Share of new frames whose whole macrostate a probe reads right from an encoder, where it is low.
+def low_share(known: Mapping[str, Any] | None) -> float | None:
+    """Share of new frames whose whole macrostate a probe reads right from an encoder of this card, where it is low.
 
-    None where at least READS_AT_LEAST are read right, where the encoder's card does not say it, and without an encoder.
+    None where at least READS_AT_LEAST are read right, where the card does not say it, and without one.
     """
-    share: float = 1.0 if path is None else card_of(path).get("probe", {}).get("mlp", 1.0)
+    share: float = 1.0 if known is None else known.get("probe", {}).get("mlp", 1.0)
     return share if share < READS_AT_LEAST else None
 
 
@@ -192,15 +193,22 @@ def mark(share: float | None) -> str:
     return "" if share is None else f" (encoder reads {share:.1%})"
 
 
-def reading_warning(path: Path | None) -> str:
+def reading_warning(name: str, known: Mapping[str, Any] | None) -> str:
     """A warning about an encoder from which few frames are read right; empty where its card does not say so."""
-    share = low_share(path)
-    if path is None or share is None:
+    share = low_share(known)
+    if share is None:
         return ""
     return (
-        f"the encoder {path.stem}, from which a probe reads only {share:.1%} of new frames right (less than "
+        f"the encoder {name}, from which a probe reads only {share:.1%} of new frames right (less than "
         f"{READS_AT_LEAST:.0%}); scores say little of an agent that sees through it"
     )
+
+
+def short_card(path: Path) -> dict[str, Json]:
+    """The part of a card that reports read, which a bench keeps: the encoder may be elsewhere then."""
+    whole = card_of(path)
+    frames = whole.get("recipe", {}).get("frames", 0)
+    return {"recipe": {"frames": frames}, "probe": whole.get("probe", {}), "offer": whole.get("offer", "")}
 
 
 def card_of(path: Path) -> dict[str, Any]:

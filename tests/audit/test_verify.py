@@ -326,7 +326,8 @@ def test_two_seeds_may_learn_the_same_from_a_dataset_alone(tmp_path: Path, episo
     few = {"agents": ("table",), "seeds": (0, 1), "budgets": (episodes,), "evaluation_episodes": 4}
     how = {"execution": "kinematic", "appearance": "mild", "open_loop_starts": 0, "recorded_episodes": 0}
     played, apart, card = collected()
-    card["policy"] = "program:laws-2@0123456789ab"  # of a file whose name ends like the number of a dataset's episodes
+    # the policy is a file whose name ends like the number of a dataset's episodes
+    card = {**card, "policy": "program:laws-2@0123456789ab"}
     dataset = write_dataset(tmp_path / "set", played, apart, card, "npz").folder
     wanted, paths = plan_control("arrow_puzzle", "smoke", **few, **how, dataset=dataset)
     folder = bench(wanted, paths, root=tmp_path, launcher=Inline()).folder

@@ -87,19 +87,29 @@ def test_three_cubes_have_the_bundled_one(trained, name):
 def test_an_encoder_that_reads_few_frames_right_is_named(tmp_path, share, doubted):
     path = tmp_path / "theirs.safetensors"
     save_file({"a": np.zeros(1)}, path, {"card": json.dumps({"probe": {"mlp": share}})})
-    assert bool(encoders.reading_warning(path)) == bool(encoders.mark(encoders.low_share(path))) == doubted
+    card = encoders.card_of(path)
+    assert bool(encoders.reading_warning("theirs", card)) == bool(encoders.mark(encoders.low_share(card))) == doubted
 
 
-def test_a_bench_and_its_report_name_an_encoder_that_misreads(tmp_path, capsys):
-    """The bundled codes of the strongest look read a ninth of its frames."""
+@pytest.mark.parametrize("own", [False, True])
+def test_a_bench_and_its_report_name_an_encoder_that_misreads(tmp_path, capsys, own):
+    """The bundled codes of the strongest look read a ninth of its frames, also from a file of one's own."""
+    mine = tmp_path / "mine.safetensors"
+    shutil.copy(encoders.bundled()["arrow_puzzle-strong-codes"], mine)
     few = {"budgets": (1,), "evaluation_episodes": 1, "open_loop_starts": 0, "recorded_episodes": 0}
     agents = ("factored:given",)
-    wanted, paths = plan("arrow_puzzle", "smoke", agents=agents, appearance="strong", execution="kinematic", **few)
+    given = str(mine) if own else None
+    wanted, paths = plan(
+        "arrow_puzzle", "smoke", agents=agents, appearance="strong", execution="kinematic", encoder=given, **few
+    )
     result = bench(wanted, paths, root=tmp_path, launcher=Inline())
+    mine.unlink()
     assert "reads only 11.5% of new frames right" in capsys.readouterr().out
     page = bench_page(result)
     assert any("reads only 11.5% of new frames right" in line for line in page.answers)
     assert "(encoder reads 11.5%)" in page.summary.partition("chance level")[0]
+    (costs,) = (table for section in page.sections for table in section.tables if table.name == "cost")
+    assert "8,000" in costs.rows[0], "frames that it was made of"
 
 
 @pytest.mark.parametrize("kind", ["latents", "codes"])

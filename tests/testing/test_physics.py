@@ -63,6 +63,15 @@ def test_every_sweep_begins_as_the_scene_is_built(name):
     assert physics.SWEEPS[name][0] == getattr(physics.PhysicsSettings(), name)
 
 
+@pytest.mark.parametrize("world", ["arrows:slip=0.3", "pick_place:slip=0.5"])
+def test_where_grips_slip_by_chance_there_are_no_margins(world, tmp_path, capsys):
+    """Since a slip by the rules is no slip of the physics."""
+    out = tmp_path / "margins.json"
+    assert main(["check", "--physics", world, "--turns", "0", "--trials", "1", "--out", str(out)]) == 0
+    assert f"No margins: in {world} no macro-action is certain to move an object" in capsys.readouterr().out
+    assert json.loads(out.read_text()).keys() == {"task", "seed", "environment"}
+
+
 def test_fidelity_of_any_world_counts_what_slips():
     found = measure_fidelity(registry.task("arrows:cubes=5,coupling=neighbour,slip=0.3"), 20, "strong")
     assert found.as_ruled == found.actions == len(found.slips) == 20, found.faults

@@ -124,6 +124,55 @@ def test_the_exact_filter_keeps_what_is_right() -> None:
     assert agent.imagination.admits(z, torch.tensor(action), step, 0.0).tolist() == right
 
 
+OTHERS: dict[str, Any] = {
+    "model.members": 3,
+    "imagination.temperature": 0.5,
+    "imagination.predicts_with": "network",
+    "imagination.curiosity": 0.5,
+    "imagination.weight_samples": 9,
+    "imagination.reduction": "sum",
+    "imagination.accumulates": True,
+    "imagination.confidence_scale": 0.2,
+    "imagination.threshold": 0.1,
+    "imagination.threshold_quantile": 0.5,
+    "imagination.reward_threshold": 0.1,
+    "imagination.termination_threshold": 0.1,
+    "imagination.model_only_episodes": 5,
+    "imagination.start_episode": 3,
+    "imagination.end_episode": 5,
+    "imagination.start_states": "replayed",
+    "imagination.breadth": 5,
+    "imagination.depth": 2,
+    "imagination.updates_per_step": 2,
+    "imagination.exploration": 1.0,
+    "memory.imagined": 7,
+    "memory.priority": 0.5,
+}
+
+
+def learned_with(**settings: Any) -> dict[str, bytes]:
+    agent = built(exact.make, settings, exact_world=WORLD)
+    live(agent, 8)
+    return {name: array.tobytes() for name, array in agent.state().arrays.items()}
+
+
+@pytest.mark.parametrize("setting", OTHERS)
+def test_a_setting_of_a_learned_model_has_no_effect_on_the_exact_one(setting: str) -> None:
+    """And a bench refuses it, as each other setting without effect."""
+    same = learned_with(**{setting: OTHERS[setting]}) == learned_with()
+    assert same == (setting in registry.inert_settings("imagination_exact"))
+
+
+def test_a_bench_refuses_settings_that_do_nothing_for_a_control() -> None:
+    inert = registry.inert_settings
+    assert {"imagination.threshold", "imagination.model_only_episodes"} <= inert("imagination_exact_filter")
+    assert "imagination.confidence_scale" not in inert("imagination_exact_filter")
+    assert "imagination.model_only_episodes" in inert("imagination_memory")
+    assert "imagination.threshold" not in inert("imagination_memory")
+    with pytest.raises(InvalidValueError, match=r"model\.members has no effect on agent imagination_exact"):
+        plan("arrow_puzzle", "smoke", agents=("imagination_exact:model.members=5",))
+
+
 def test_only_who_is_given_the_world_imagines_exactly() -> None:
     with pytest.raises(InvalidValueError, match="given the exact world"):
         built(exact.make)
@@ -133,14 +182,23 @@ def test_only_who_is_given_the_world_imagines_exactly() -> None:
 
 
 @pytest.mark.parametrize("agent", ["imagination_exact", "imagination_exact_filter"])
-def test_the_rules_of_a_task_are_not_taken_for_those_of_the_tasks_before_it(agent: str) -> None:
+@pytest.mark.parametrize(
+    ("option", "sentence"),
+    [
+        ({"after": ("arrow_puzzle_hard",), "unannounced": True}, "here another comes before"),
+        ({"feedback": 2.0}, "a teacher adds to rewards"),
+    ],
+)
+def test_the_rules_are_given_where_all_rewards_of_training_are_theirs(
+    agent: str, option: dict[str, Any], sentence: str
+) -> None:
+    """Earlier tasks have other rules, and a teacher's feedback is in no rule."""
     alone = protocol("arrow_puzzle", "smoke", agents=(agent,))
-    after = replace(alone, after=("arrow_puzzle_hard",), unannounced=True)
-    given = [context_of(RunSpec(protocol=each, agent=agent, seed=0)) for each in (alone, after)]
+    given = [context_of(RunSpec(protocol=replace(alone, **more), agent=agent, seed=0)) for more in ({}, option)]
     assert given[0].exact_world is not None
     assert given[1].exact_world is None
-    with pytest.raises(UnableError, match=f"^Agent '{agent}' is given the exact rules of one task"):
-        protocol("arrow_puzzle", "smoke", agents=(agent,), after=("arrow_puzzle_hard",), unannounced=True)
+    with pytest.raises(UnableError, match=f"^Agent '{agent}' is given the exact rules of one task.*{sentence}"):
+        protocol("arrow_puzzle", "smoke", agents=(agent,), **option)
 
 
 @pytest.mark.parametrize("agent", [name for name, entry in registry.agents().items() if entry.privileged])

@@ -10,10 +10,12 @@ import pytest
 import torch
 from fake_latents import ACTIONS, CODES, LATENTS, FakeEncoder, built, frame, transition, with_own_settings
 from imagine_bench.agents.encoders.perception import Perception
+from imagine_bench.agents.imagination.vector_env import imagined_env
 from imagine_bench.agents.replay import Batch
 from imagine_bench.agents.world_models import latent
 from imagine_bench_controls.memory import drqn, imagination, readout, world_model
 from imagine_bench_controls.memory.agent import RememberingAgent
+from imagine_bench_controls.memory.imagination import ImaginingMemoryAgent
 from imagine_bench_controls.memory.sequences import START, Recurrence, SequenceMemory
 
 from imagine_bench.interfaces import AgentState, Frame, Observation
@@ -339,3 +341,20 @@ def test_a_read_out_is_of_the_present_world_alone(how: str) -> None:
     else:
         agent.reset_for_new_task()
         assert live(agent, shown=0) == [readout.NEVER_SEEN]
+
+
+def test_an_imagined_world_begins_in_states_with_their_memory() -> None:
+    """A state is the latents and the memory after a frame, from the memory that was stored before it."""
+    agent = make("imagination_memory", **{"controller.updates_per_step": 0, "imagination.start_episode": 100})
+    assert isinstance(agent, ImaginingMemoryAgent)
+    with mock.patch.object(agent, "learn_model"):  # the network stays as it was, so that nothing stored is out of date
+        recall(agent, range(3), np.random.default_rng(0))
+    env = imagined_env(agent, num_envs=2)
+    actions = agent.real.arrays()["action"]
+    for row, cue in enumerate(agent.real.arrays()["mu"][::2]):
+        frames = [frame(int(FakeEncoder().read_macrostate(torch.as_tensor(cue)[None])[0, 0])), frame(0)]
+        for step in (0, 1):
+            wanted = agent.perception.recall(frames[: step + 1], actions[2 * row : 2 * row + step].tolist())[0]
+            assert env.starts[2 * row + step] == pytest.approx(wanted.numpy(), abs=1e-6)
+    assert env.reset(seed=0)[0].shape == (2, LATENTS + UNITS)
+    assert np.isfinite(env.step(np.array([0, 1]))[1]).all()

@@ -19,6 +19,7 @@ from imagine_bench_controls.swaps import SwappingDQN
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentContext, Observation
+from imagine_bench.running.bench import plan
 from imagine_bench.seeding import SeedTree
 
 CPU = torch.device("cpu")
@@ -109,3 +110,15 @@ def test_latents_have_no_parts_to_swap(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = AgentContext(n_actions=4, preprocessing="gray_strips", encoder=None, seeds=SeedTree(0))
     with pytest.raises(InvalidValueError, match="swaps factors of codes"):
         swaps.make(asked)
+
+
+def test_priorities_do_not_change_swaps() -> None:
+    """A swapped transition's error is not that of the real one whose place it has; so no bench takes them."""
+    states = []
+    for own in ({}, {"memory.priority": 1.0, "memory.priority_correction": 0.9}):
+        learner = agent(**own)
+        live(learner, 5)
+        states.append({name: array.tobytes() for name, array in learner.state().arrays.items()})
+    assert states[0] == states[1]
+    with pytest.raises(InvalidValueError, match=r"memory\.priority has no effect on agent dqn_swaps"):
+        plan("arrow_puzzle", "smoke", agents=("dqn_swaps:memory.priority=1",))

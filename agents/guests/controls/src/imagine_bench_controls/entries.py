@@ -28,7 +28,7 @@ IMAGINATION_MEMORY = AgentEntry(
 )
 IMAGINATION_EXACT = AgentEntry(
     make="imagine_bench_controls.exact:make",
-    settings="imagine_bench.agents.imagination.settings:HYPERPARAMETERS",
+    settings="imagine_bench.agents.imagination.inert:KNOWING",
     privileged=True,
     needs_exact_world=True,
     title="imagination, exact model",
@@ -36,7 +36,7 @@ IMAGINATION_EXACT = AgentEntry(
 )
 IMAGINATION_EXACT_FILTER = AgentEntry(
     make="imagine_bench_controls.exact:make_filter",
-    settings="imagine_bench.agents.imagination.settings:HYPERPARAMETERS",
+    settings="imagine_bench.agents.imagination.inert:UNFILTERED",
     privileged=True,
     needs_exact_world=True,
     title="imagination, exact filter",

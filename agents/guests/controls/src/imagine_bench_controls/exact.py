@@ -205,11 +205,12 @@ def _drawn(outcomes: Sequence[Outcome], chance: float) -> Outcome:
 def build(
     kind: type[ExactImaginationAgent] | type[ExactFilterAgent], context: AgentContext
 ) -> ExactImaginationAgent | ExactFilterAgent:
-    """A control that knows the world; InvalidValueError where none is given, or frames hide some of it."""
+    """A control that knows the world; InvalidValueError where none is given."""
     if context.exact_world is None:
         raise InvalidValueError(
             "This control is given the exact world, which an agent gets that is registered as privileged, in a world "
-            "whose frames hide nothing, and before which no other task comes; here there is none."
+            "whose frames hide nothing, before which no other task comes, and without a teacher's feedback; here there "
+            "is none."
         )
     settings = HYPERPARAMETERS.of(context)
     device = prepare_torch(context.device)

@@ -54,7 +54,7 @@ def _hyperparameters(
     return Hyperparameters({"chapter_3": group(published_3, FAST_3), "chapter_5": group(published, FAST_5)})
 
 
-SWAPPING = _hyperparameters(SwappingSettings(), SwappingSettings(controller=CONTROLLER_3), {})
+SWAPPING = _hyperparameters(SwappingSettings(), SwappingSettings(controller=CONTROLLER_3), {}, PRIORITIES)
 EFFICIENT = _hyperparameters(
     EfficientSettings(), EfficientSettings(controller=CONTROLLER_3),
     {

@@ -77,6 +77,14 @@ class ImaginingMemoryAgent(RememberingAgent, ImaginingAgent):
         super().reset_for_new_task()
         self.read_out = None
 
+    @torch.no_grad()
+    def remembered_states(self) -> Tensor:
+        """With the memory after each frame, from that which was stored before it. Shape (N, Z + H)."""
+        rows = self.real.arrays()
+        device = self.perception.encoder.device
+        mu, before, stored = (torch.as_tensor(rows[name], device=device) for name in ("mu", "before", "stored"))
+        return torch.cat([mu, self.recurrence(mu.unsqueeze(1), before.unsqueeze(1), stored)[:, 0]], dim=-1)
+
     def draw_model_batches(self, generator: torch.Generator) -> Iterator[Batch]:
         """Replayed sequences as transitions between states, through which losses reach the recurrent network."""
         settings = self.settings.model

@@ -8,6 +8,7 @@ from typing import TypeVar
 
 from imagine_bench.agents.dqn_settings import HYPERPARAMETERS as PLAIN_DQN
 from imagine_bench.agents.dqn_settings import DQNSettings
+from imagine_bench.agents.imagination.inert import FILTERED
 from imagine_bench.agents.imagination.settings import HYPERPARAMETERS as IMAGINATION
 from imagine_bench.agents.imagination.settings import Settings
 from imagine_bench.agents.settings import (
@@ -84,4 +85,4 @@ def _with_memory(
 
 
 DRQN = _with_memory(RecurrentDQNSettings, PLAIN_DQN, _FAST_DQN)
-IMAGINATION_MEMORY = _with_memory(RecurrentSettings, IMAGINATION, _FAST_IMAGINATION)
+IMAGINATION_MEMORY = _with_memory(RecurrentSettings, IMAGINATION, _FAST_IMAGINATION).without(*FILTERED.has_no_effect)
