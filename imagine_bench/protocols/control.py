@@ -476,8 +476,8 @@ def _require_exact_world(agent: str, wanted: Protocol) -> None:
         )
     if wanted.feedback:
         raise UnableError(
-            f"Agent {agent!r} is given the exact rules of one task, and here a teacher adds to rewards; leave --feedback "
-            "out, or that agent."
+            f"Agent {agent!r} is given the exact rules of one task, and here a teacher adds to rewards; leave "
+            "--feedback out, or that agent."
         )
 
 
