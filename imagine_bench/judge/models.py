@@ -5,14 +5,12 @@ An agent's own reading of its images counts for nothing when it is judged: they 
 
 from __future__ import annotations
 
-import functools
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -292,21 +290,8 @@ def runs_of(model: str) -> dict[int, Path]:
     """
     folder = Path(model)
     configs = [folder / _CONFIG] if (folder / _CONFIG).is_file() else folder.glob(f"seed_*/{_CONFIG}")
-    found = {_config_of(config.parent)["seed"]: config.parent for config in configs}
+    found = {read_sealed(config, "a run's configuration")["seed"]: config.parent for config in configs}
     return dict(sorted(found.items()))
-
-
-def _config_of(run: Path) -> dict[str, Any]:
-    """The configuration of a run, read once while its file stays: each cell of a judgement asks about every run."""
-    config = run / _CONFIG
-    state = config.stat()
-    return _read_config(config, (state.st_dev, state.st_ino, state.st_mtime_ns, state.st_size))
-
-
-@functools.cache
-def _read_config(config: Path, state: tuple[int, ...]) -> dict[str, Any]:
-    del state
-    return read_sealed(config, "a run's configuration")
 
 
 def model_entry(model: str) -> WorldModelEntry:
@@ -328,7 +313,7 @@ def model_entry(model: str) -> WorldModelEntry:
                 "folder in which it was made, while the runs are there."
             ) from None
     seed, folder = next(iter(runs.items()))
-    config = _config_of(folder)
+    config = read_sealed(folder / _CONFIG, "a run's configuration")
     agent = agent_label(config["agent"], config["protocol"])
     entry = kept_entry(agent, folder)
     title = entry.title or agent

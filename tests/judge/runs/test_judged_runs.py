@@ -15,7 +15,7 @@ from small_runs import Inline, do, small
 from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import State
-from imagine_bench.judge import judgement, models, questions
+from imagine_bench.judge import judgement, questions
 from imagine_bench.judge.judgement import Judgement, judge, kept, shown
 from imagine_bench.judge.models import ModelSource, model_entry, opened, source_of
 from imagine_bench.judge.reading import RenderedFrameIndex
@@ -99,27 +99,6 @@ def test_a_run_that_was_made_anew_is_judged_anew(tmp_path: Path) -> None:
     shutil.rmtree(run.folder)
     benches.bench(wanted, {}, root=tmp_path, launcher=Inline())
     assert kept(folder, one) == []
-
-
-def test_each_runs_configuration_is_read_once_for_all_cells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Five runs of two agents; one that is written anew meanwhile is read again."""
-    wanted = small(agents=("table", "imaginer"), seeds=(0, 1, 2, 3, 4))
-    for agent, seed in wanted.runs:
-        run = tmp_path / agent / f"seed_{seed}"
-        run.mkdir(parents=True)
-        config = {"format": run_folder.FORMAT, "protocol": wanted.as_dict(), "agent": agent, "seed": seed}
-        write_json(run / "config.json", sealed({**config, "settings": {}}))
-    agents = tuple(str(tmp_path / agent) for agent in wanted.agents)
-    reads = list[Path]()
-    read = models.read_sealed
-    monkeypatch.setattr(models, "read_sealed", lambda file, what: reads.append(file) or read(file, what))
-    one = Judgement(task="arrow_puzzle", models=agents, sizes=(20,), seeds=(1000,), samples=1)
-    assert kept(tmp_path, one) == [] and len(one.cells) == 10
-    every = sorted(tmp_path.glob("*/*/config.json"))
-    assert sorted(reads) == every
-    write_json(run / "config.json", sealed({**config, "settings": {}}))
-    assert len(one.cells) == 10
-    assert reads[10:] == [run / "config.json"]
 
 
 def _source(name: str, task: str, appearance: str = "clean", encoder: str | None = None) -> ModelSource:
