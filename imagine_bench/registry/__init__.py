@@ -246,8 +246,8 @@ def spelled(name: str, group: str) -> str:
     """The one spelling of a typed name: an argument is written as the package of its prefix writes it.
 
     A package writes ``ARGUMENT@<12 hex digits>`` where content decides, such as that of a file: then a protocol with
-    this name holds for that content alone. Whole numbers are written without a point, so that ``=1`` and ``=1.0`` are
-    one name, that of kept benches.
+    this name holds for that content alone. Values of settings are of their settings' types, so that ``=1`` and ``=1.0``
+    are one name.
 
     Raises:
         InvalidValueError: The argument names nothing, or a text after ``@`` is not that of its content now.
@@ -264,7 +264,7 @@ def spelled(name: str, group: str) -> str:
         return str(one) if target else name
     with suppress(UnknownNameError, InvalidValueError, SetupError):  # which is said where the entry is asked for
         where = _named_entry(one, _OF_GROUPS[group], group).settings
-        one = one._replace(settings=_without_points(where, one.settings))
+        one = one._replace(settings=_typed_settings(where, one.settings))
     return str(one)
 
 
@@ -292,16 +292,6 @@ def typed_overrides(
             typed[name].append(value)
     agreed = {name: values[0] for name, values in typed.items() if len({*map(type, values)}) == 1}
     return tuple((name, agreed.get(name, value)) for name, value in given.items())
-
-
-def _without_points(where: str, given: Mapping[str, Setting]) -> dict[str, Setting]:
-    """Values of settings, 1.0 written as 1 where the settings take that for the same."""
-    typed = _typed_settings(where, given)
-    short: dict[str, Setting] = {
-        name: int(value) if isinstance(value, float) and value.is_integer() else value for name, value in typed.items()
-    }
-    again = _typed_settings(where, short)
-    return short if [*map(repr, again.values())] == [*map(repr, typed.values())] else typed
 
 
 def _typed_settings(where: str, given: Mapping[str, Setting]) -> dict[str, Setting]:
