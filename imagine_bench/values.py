@@ -19,8 +19,6 @@ Json = Scalar | Sequence["Json"] | Mapping[str, "Json"]
 """A value that a JSON file can hold."""
 
 
-_WHOLE = 2**53
-"""Whole numbers up to it are floats without a loss."""
 KINDS = {int: "a whole number", float: "a number", str: "a text", bool: "True or False", types.NoneType: "none"}
 """The kinds of plain values, in words."""
 
@@ -46,15 +44,6 @@ def dotted(settings: Mapping[str, Setting], before: str = "") -> dict[str, Setti
     for name, value in settings.items():
         found |= dotted(value, f"{before}{name}.") if isinstance(value, Mapping) else {f"{before}{name}": value}
     return found
-
-
-def in_kind_of(known: Setting, value: Setting) -> Setting:
-    """A value, its whole numbers as floats where ``known``, a value of the same setting, has floats."""
-    if type(known) is float and type(value) is int and abs(value) < _WHOLE:
-        return float(value)
-    if isinstance(known, list | tuple) and isinstance(value, list | tuple) and len(known) == len(value):
-        return tuple(in_kind_of(one, other) for one, other in zip(known, value, strict=True))  # type: ignore[misc]
-    return value
 
 
 def grouped(arrays: Mapping[str, Array]) -> dict[str, Arrays]:

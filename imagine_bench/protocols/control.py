@@ -42,7 +42,6 @@ from imagine_bench.registry import (
     spelled,
     task,
     task_entry,
-    typed_overrides,
 )
 from imagine_bench.registry import task_name as canonical
 from imagine_bench.registry.by_value import CodeByValue
@@ -369,9 +368,7 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
         values["seeds"] = tuple(range(max(few.values())))
     values["execution"] = spec.execution(values.get("execution"))
     if isinstance(values.get("agents"), list | tuple):  # any other type is refused below
-        values["agents"] = _spelled(values["agents"])
-        values["headlines"] = _spelled(values.get("headlines", ()))
-        few = {spelled(agent, AGENT_GROUP): most for agent, most in few.items()}
+        values["agents"] = tuple(spelled(agent, AGENT_GROUP) for agent in values["agents"])
     values["after"] = tuple(map(canonical, values.get("after", ())))
     values["physics"] = _pairs_of_physics(values.get("physics", ()))
     if values.get("split") is not None:
@@ -380,7 +377,6 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     agents = {*wanted.agents}
     wanted = dataclasses.replace(
         wanted,
-        overrides=typed_overrides(wanted.agents, wanted.overrides, AGENT_GROUP),
         headlines=tuple(pair for pair in wanted.headlines if agents.issuperset(pair)),
         few_seeds=tuple(
             (agent, wanted.seeds[most - 1])
@@ -396,11 +392,6 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     _require_learner(wanted)
     require_same_world(wanted.task, wanted.after)
     return wanted
-
-
-def _spelled(names: Any) -> Any:
-    """Names of agents, alone or in sequences, each in its one spelling; anything else as it is, to be refused."""
-    return tuple(map(_spelled, names)) if isinstance(names, list | tuple) else spelled(names, AGENT_GROUP)
 
 
 def _pairs_of_physics(given: object) -> tuple[tuple[str, Setting], ...]:

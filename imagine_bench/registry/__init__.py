@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -52,7 +52,7 @@ from imagine_bench.registry.plugins import (
     require_guest,
     usable,
 )
-from imagine_bench.values import Setting, dotted, in_kind_of
+from imagine_bench.values import Setting
 
 __all__ = [
     "AGENTS",
@@ -246,8 +246,7 @@ def spelled(name: str, group: str) -> str:
     """The one spelling of a typed name: an argument is written as the package of its prefix writes it.
 
     A package writes ``ARGUMENT@<12 hex digits>`` where content decides, such as that of a file: then a protocol with
-    this name holds for that content alone. Values of settings are of their settings' types, so that ``=1`` and ``=1.0``
-    are one name.
+    this name holds for that content alone.
 
     Raises:
         InvalidValueError: The argument names nothing, or a text after ``@`` is not that of its content now.
@@ -257,52 +256,10 @@ def spelled(name: str, group: str) -> str:
     one = parse_configuration(name)
     prefix = one.agent.partition(":")[0]
     target = getattr(_prefixes(group).get(prefix), "argument", "")
-    if target:
-        with guests_faults(f"The argument of {name}", target):
-            one = one._replace(agent=f"{prefix}:{load(target)(one.argument)}")
-    if not one.settings:
-        return str(one) if target else name
-    with suppress(UnknownNameError, InvalidValueError, SetupError):  # which is said where the entry is asked for
-        where = _named_entry(one, _OF_GROUPS[group], group).settings
-        one = one._replace(settings=_typed_settings(where, one.settings))
-    return str(one)
-
-
-_OF_GROUPS: Mapping[str, Mapping[str, Any]] = {
-    AGENT_GROUP: AGENTS,
-    REGRESSOR_GROUP: REGRESSORS,
-    WORLD_MODEL_GROUP: WORLD_MODELS,
-}
-"""This suite's own objects of the groups whose names may have settings."""
-
-
-def typed_overrides(
-    names: Iterable[str], overrides: Iterable[tuple[str, Setting]], group: str
-) -> tuple[tuple[str, Setting], ...]:
-    """The overrides of a protocol, each value of the type that all agents or regressors that have it want."""
-    given = dict(overrides)
-    if not given:
-        return ()
-    typed: dict[str, list[Setting]] = {name: [] for name in given}
-    for each in names:
-        where = _named_entry(parse_configuration(each), _OF_GROUPS[group], group).settings
-        with guests_faults(f"{each}, its settings", where):
-            known = load(where).names() if where else ()
-        for name, value in _typed_settings(where, {n: value for n, value in given.items() if n in known}).items():
-            typed[name].append(value)
-    agreed = {name: values[0] for name, values in typed.items() if len({*map(type, values)}) == 1}
-    return tuple((name, agreed.get(name, value)) for name, value in given.items())
-
-
-def _typed_settings(where: str, given: Mapping[str, Setting]) -> dict[str, Setting]:
-    """Values of settings, in the types that these have; as given where the settings refuse them."""
-    with suppress(UnknownNameError, InvalidValueError, SetupError), guests_faults("Settings", where):
-        known = load(where)
-        groups = [AgentContext.config_group, *getattr(known, "groups", ())]
-        group = groups[0] if groups[0] in groups[1:] or len(groups) == 1 else groups[1]
-        whole = dotted(dataclasses.asdict(known.resolve(AgentContext.hyperparameters, given, group)))
-        return {name: in_kind_of(whole[name], value) for name, value in given.items()}
-    return dict(given)
+    if not target:
+        return name
+    with guests_faults(f"The argument of {name}", target):
+        return str(one._replace(agent=f"{prefix}:{load(target)(one.argument)}"))
 
 
 def setting_names(agent: str) -> frozenset[str]:

@@ -80,9 +80,6 @@ def plan(task: str, preset: str, **changes: Any) -> tuple[RegressionProtocol, di
     if preset == "smoke":
         values.setdefault("variants", registry.regression(task).variants[:2])
     wanted = RegressionProtocol(task=task, preset=preset, **values)
-    named = tuple(registry.spelled(agent, registry.REGRESSOR_GROUP) for agent in wanted.agents)
-    overrides = registry.typed_overrides(named, wanted.overrides, registry.REGRESSOR_GROUP)
-    wanted = replace(wanted, agents=named, overrides=overrides)
     settings = _every_setting(wanted)
     return replace(wanted, settings_digest=digest(settings), code=package_digests(wanted.code_places())), {}
 

@@ -172,31 +172,16 @@ class Suite:
 
     @property
     def hash(self) -> str:
-        """12 hex digits that change when anything in any level does; seeds and tests count, too, but not agents.
-
-        Two spellings of one world, or of one number, have one hash.
-        """
+        """12 hex digits that change when anything in any level does; seeds and tests count, too, but not agents."""
         fields = dataclasses.asdict(self)
         del fields["agents"]
         for each in fields["experiments"]:
             each["dial"] = each.pop("parameter")  # the name that it had, so that hashes stay
-            for level in each["levels"]:
-                level["task"] = registry.task_name(level["task"])
-                level["protocol"] = _whole_numbers(level["protocol"])
         return digest(fields)
 
     def only(self, names: Sequence[str]) -> Suite:
         """The suite with some of its experiments, or all if none are named. Raises UnknownNameError."""
         return replace(self, experiments=_chosen("experiment", names, self.experiments))
-
-
-def _whole_numbers(value: Any) -> Any:
-    """JSON-like values in which 1.0 is written 1: a field of whole numbers takes no other."""
-    if isinstance(value, Mapping):
-        return {name: _whole_numbers(part) for name, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_whole_numbers(part) for part in value]
-    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def _chosen(what: str, names: Sequence[str], members: tuple[Member, ...]) -> tuple[Member, ...]:

@@ -176,15 +176,6 @@ def test_any_change_of_any_level_changes_the_hash():
     assert len(hashes) == 5
 
 
-def test_the_same_levels_have_one_hash_however_they_are_typed():
-    def suite(one, zero):
-        physics = {"execution": "physics", "physics": {"pad_friction": one}, "overrides": (("model.dropout", zero),)}
-        levels = (Level(name="a", task=f"arrows:cubes=2,slip={zero}", protocol=physics),)
-        return Suite(name="own", experiments=(Experiment(name="a", parameter="p", question="?", levels=levels),))
-
-    assert suite(1, 0).hash == suite(1.0, 0.0).hash != suite(0.5, 0.5).hash
-
-
 def test_every_level_is_a_world_in_which_something_can_be_learned():
     for each in GRIDS[SUITE].experiments:
         assert 3 <= len(each.levels) <= 5
