@@ -28,7 +28,7 @@ IMAGINATION_MEMORY = AgentEntry(
 )
 IMAGINATION_EXACT = AgentEntry(
     make="imagine_bench_controls.exact:make",
-    settings="imagine_bench.agents.imagination.inert:KNOWING",
+    settings="imagine_bench_controls.settings:KNOWING",
     privileged=True,
     needs_exact_world=True,
     title="imagination, exact model",

@@ -1,10 +1,11 @@
-"""Settings of the controls that are a DQN with something added."""
+"""Settings of the controls that are a DQN with something added, or that imagine with the rules."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
 from imagine_bench.agents.dqn_settings import CONTROLLER_3, FAST_3, FAST_5, DQNSettings
+from imagine_bench.agents.imagination.inert import UNFILTERED
 from imagine_bench.agents.settings import PROBABILITY, ConfigGroup, Hyperparameters, Override, S, between, setting
 
 _MANY = "BBF's replay ratio"
@@ -63,3 +64,16 @@ EFFICIENT = _hyperparameters(
     },
     PRIORITIES,
 )  # fmt: skip
+
+_OF_A_MODEL = (
+    *(name for name in UNFILTERED.names() if name.startswith("model.")),
+    "imagination.temperature",
+    "imagination.predicts_with",
+    "imagination.curiosity",
+    "imagination.weight_samples",
+    "imagination.reduction",
+    "imagination.accumulates",
+    "imagination.confidence_scale",
+)
+KNOWING = UNFILTERED.without(*UNFILTERED.has_no_effect, *_OF_A_MODEL)
+"""Of agents that imagine with the rules in place of a learned model."""
