@@ -112,7 +112,7 @@ def numbers(diagnostics: Mapping[str, Any]) -> dict[str, float]:
     found: dict[str, float] = {}
     for name, value in diagnostics.items():
         try:
-            found[name] = value if type(value) in (int, float) else float(value)
+            found[name] = value if type(value) in (int, float) else float(value + 0)  # not of a text
         except (TypeError, ValueError):
             raise InvalidValueError(f"The diagnostic {name!r} is {brief(value)}; give a number.") from None
     return found

@@ -247,6 +247,8 @@ def test_diagnostics_of_any_kind_of_number_are_read_again_from_a_report(tmp_path
     assert [float(frame[name][0]) for name in ("done", "small", "tensor", "steps")] == [1.0, 0.5, 2.0, 3.0]
     with pytest.raises(InvalidValueError, match=r"diagnostic 'many' is array\(\[1, 2\]\); give a number"):
         values.numbers({"many": np.array([1, 2])})
+    with pytest.raises(InvalidValueError, match=r"diagnostic 'text' is '3'; give a number"):
+        values.numbers({"text": "3"})
 
 
 @pytest.mark.parametrize(

@@ -306,7 +306,7 @@ def model_entry(model: str) -> WorldModelEntry:
         try:
             return registry.world_model_entry(model)
         except UnknownNameError:
-            if len(Path(model).parts) == 1:
+            if len(Path(parse_configuration(model).agent).parts) == 1:
                 raise
             raise ArtefactError(
                 f"There is no run of an agent in {model}, seen from {Path.cwd()}. A judgement of runs is read from the "

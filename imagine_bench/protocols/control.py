@@ -460,6 +460,8 @@ def _require_exact_world(agent: str, wanted: Protocol) -> None:
             f"Agent {agent!r} imagines from true macrostates, and frames of {wanted.task} hide a part of them or are "
             "late; leave it out, or the parameters gesture and lag."
         )
+    if not agent_entry(agent).learns:  # it is trained neither on earlier tasks nor by a teacher
+        return
     if wanted.after:
         raise UnableError(
             f"Agent {agent!r} is given the exact rules of one task, and here another comes before; leave --after out, "

@@ -66,8 +66,8 @@ class AgentEntry:
     #: group)``; by default it has none.
     settings: str = ""
     privileged: bool = False  #: Whether it is shown the macrostate and the rules; no fair comparison
-    #: Whether it cannot do without :attr:`.AgentContext.exact_world`, which there is where frames hide nothing, no
-    #: other task comes before, and no teacher adds to rewards; elsewhere a bench refuses it
+    #: Whether it cannot do without :attr:`.AgentContext.exact_world`, which there is where frames hide nothing and,
+    #: if it learns, no other task comes before and no teacher adds to rewards; elsewhere a bench refuses it
     needs_exact_world: bool = False
     #: Whether it is a person, or a program elsewhere, whose episodes are kept as a run; nothing here can act for it
     is_player: bool = False

@@ -211,10 +211,18 @@ def encoder_of(data: ReportData, agent: str) -> str | None:
 def card_of(data: ReportData, agent: str) -> Record | None:
     """The card of the encoder that an agent sees through, also of one's own file, which is kept with the bench."""
     used = encoder_of(data, agent)
-    facts: Any = data.result.environment
-    merged = [each for name, each in facts.items() if name.startswith("bench ")]
-    kept = [cards[used] for each in (facts, *merged) if used in (cards := each.get("encoders", {}))]
-    return encoders.card(used) or next(iter(kept), None)
+    if used is None:
+        return None
+    return encoders.card(used) or _kept_cards(data.result.environment).get(used)
+
+
+def _kept_cards(facts: Any) -> dict[str, Record]:
+    """The cards of encoders that a bench keeps, by identity; of a merged one those of its benches."""
+    cards = dict(facts.get("encoders", {}))
+    for name, each in facts.items():
+        if name.startswith("bench "):
+            cards |= _kept_cards(each)
+    return cards
 
 
 def frames_before(data: ReportData, agent: str) -> float:

@@ -6,6 +6,7 @@ import copy
 import dataclasses
 import functools
 import itertools
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from typing import NamedTuple
@@ -32,6 +33,7 @@ from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.running.evaluation import play
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
+from imagine_bench.values import numbers
 
 _MOST = 200  # starts and macro-actions tried
 _KEYS = {"macrostate", "is_success", "legal", "fault"}
@@ -243,7 +245,7 @@ def _acts(one: CheckedAgent) -> None:
     if one.entry.learns:
         require(once == again, "asked twice with explore=False, it acts otherwise")
         require(same_state(before, agent.state()), "acting with explore=False changes its state")
-    require(all(isinstance(value, (int, float)) for value in agent.diagnostics().values()), "diagnostics: no numbers")
+    numbers(agent.diagnostics())  # raises, if one is none
 
 
 def greedy(agent: Agent, given: Sequence[Observation]) -> list[int]:
@@ -275,9 +277,14 @@ def same_state(one: AgentState, other: AgentState) -> bool:
         values = dict(state.values)
         if isinstance(values.get("meters"), dict):
             values["meters"] = {name: value for name, value in values["meters"].items() if not name.startswith("time/")}
-        return repr(sorted(values.items()))  # in which a NaN equals itself
+        return json.dumps(values, sort_keys=True, default=_plain)  # as it is kept; a NaN equals itself there
 
     return untimed(one) == untimed(other) and same_arrays(one, other)
+
+
+def _plain(value: object) -> object:
+    """A number or an array of numpy as JSON can hold it."""
+    return np.asarray(value).tolist()
 
 
 def same_arrays(one: AgentState, other: AgentState) -> bool:

@@ -20,6 +20,7 @@ from imagine_bench.report.bench import bench_page, cost
 from imagine_bench.report.data import (
     DIFFERENCE,
     SCORE,
+    card_of,
     collect,
     frames_before,
     known_agent,
@@ -46,6 +47,15 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> BenchResult:
         )  # fmt: skip
 
     return rewritten(bench_result(tmp_path_factory.mktemp("bench"), protocol=protocol), change)
+
+
+def test_the_card_of_an_encoder_outlives_two_merges(result: BenchResult) -> None:
+    """A merged bench keeps the facts of its benches below their numbers, and may be merged again."""
+    protocol = dataclasses.replace(result.protocol, encoder="mine@0123456789ab")
+    kept = {"encoders": {"mine@0123456789ab": {"frames": 8_000}}}
+    for facts in (kept, {"bench 1": {}, "bench 2": kept}, {"bench 1": {"bench 1": {}, "bench 2": kept}}):
+        merged = dataclasses.replace(result, protocol=protocol, environment=facts)
+        assert card_of(collect(merged), "imagination") == {"frames": 8_000}
 
 
 @pytest.mark.parametrize("agent", ["random", "imagination"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -15,7 +16,7 @@ from imagine_bench.tasks.macro_env import MacroEnv
 
 from imagine_bench import registry
 from imagine_bench.interfaces import AgentContext, AgentState
-from imagine_bench.testing.checks import AGENT_CHECKS
+from imagine_bench.testing.checks import AGENT_CHECKS, same_state
 from imagine_bench.testing.contract import Checks, checks, report
 
 
@@ -182,6 +183,18 @@ class _SharesValues(_Sound):
         return AgentState(arrays=state.arrays, values={**state.values, "rewards": self.rewards})
 
 
+def test_states_are_compared_as_they_are_kept() -> None:
+    """In JSON there are no tuples, no numbers of numpy and no order of names."""
+
+    def state(**values: Any) -> AgentState:
+        return AgentState(arrays={"a": np.zeros(2)}, values=values)
+
+    one = state(rate=0.1, pair=[1, 2], counts={"a": 1, "b": 2}, unknown=math.nan)
+    same = state(pair=(1, np.int64(2)), rate=np.float64(0.1), counts={"b": 2, "a": 1}, unknown=math.nan)
+    assert same_state(one, same)
+    assert not same_state(one, state(rate=0.1, pair=[1, 3], counts={"a": 1, "b": 2}, unknown=math.nan))
+
+
 class _Wordy(_Sound):
     def diagnostics(self) -> Any:
         return {"loss": "small"}
@@ -216,7 +229,7 @@ def _none(context: AgentContext) -> None:
         (_Counting, "acting with explore=False changes its state"),
         (_CountsInValues, "acting with explore=False changes its state"),
         (_SharesValues, "later learning alters a state that it gave before"),
-        (_Wordy, "diagnostics: no numbers"),
+        (_Wordy, "diagnostic 'loss' is 'small'; give a number"),
         (_Sharing, "later learning alters a state that it gave before"),
         (_Uncertain, "it goes on to the same bits: it acts otherwise"),
         (_Forgets, "its later state differs"),

@@ -199,6 +199,9 @@ def test_the_rules_are_given_where_all_rewards_of_training_are_theirs(
     assert given[1].exact_world is None
     with pytest.raises(UnableError, match=f"^Agent '{agent}' is given the exact rules of one task.*{sentence}"):
         protocol("arrow_puzzle", "smoke", agents=(agent,), **option)
+    planner = replace(registry.agent_entry(agent), learns=False)  # of rules, which is trained on nothing
+    with mock.patch.dict(registry.AGENTS, {"planner": planner}):
+        assert protocol("arrow_puzzle", "smoke", agents=("dqn", "planner"), **option).agents == ("dqn", "planner")
 
 
 @pytest.mark.parametrize("agent", [name for name, entry in registry.agents().items() if entry.privileged])

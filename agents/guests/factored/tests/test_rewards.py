@@ -148,6 +148,24 @@ def test_a_resumed_run_classes_rewards_by_the_same_transitions(begins: int) -> N
     assert resumptions > 5
 
 
+def test_a_state_with_one_column_of_what_is_clear_is_taken_up() -> None:
+    """As agents kept it for some hours of 2026-11-30: both codes of a transition were clear, or neither."""
+    learner = fake_codes.agent()
+    for episode in range(5):
+        learner.begin_episode()
+        for row in fake_codes.drawn(np.random.default_rng(episode)):
+            learner.observe(fake_codes.transition(row.code, row.action), episode=episode)
+    state = learner.state()
+    arrays = dict(state.arrays)
+    arrays["replay/is_clear"] = np.arange(len(learner.replay)) % 2 == 0
+    del arrays["replay/code_is_clear"], arrays["replay/following_is_clear"]
+    resumed = fake_codes.agent()
+    resumed.restore(replace(state, arrays=arrays))
+    known = [(row.code_is_clear, row.following_is_clear) for row in resumed.replay]
+    assert len(known) > 1
+    assert known == [(place % 2 == 0,) * 2 for place in range(len(known))]
+
+
 @pytest.mark.slow
 def test_it_learns_from_noisy_rewards_and_resumes_to_the_same_bits() -> None:
     learner = agent()

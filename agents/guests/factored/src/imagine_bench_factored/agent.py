@@ -288,17 +288,20 @@ def completed(state: AgentState) -> AgentState:
     """A snapshot with all that those of earlier versions lack.
 
     Until 2026-11-28 there were no classes of rewards, so every reward was its own class; until 2026-11-29 nothing told
-    which transitions began an episode, so starts were no evidence; until 2026-11-30 all codes counted as clear.
+    which transitions began an episode, so starts were no evidence; until 2026-11-30 all codes counted as clear, and for
+    some hours of that day one column told of both codes of a transition.
     """
     if "replay/reward" not in state.arrays:
         return state
     rewards = state.arrays["replay/reward"]
+    given = dict(state.arrays)
+    clear = given.pop("replay/is_clear", np.ones(len(rewards), dtype=np.bool_))
     arrays = {
         "replay/class_reward": rewards.astype(np.float64),
         "replay/is_first": np.zeros(len(rewards), dtype=np.bool_),
-        "replay/code_is_clear": np.ones(len(rewards), dtype=np.bool_),
-        "replay/following_is_clear": np.ones(len(rewards), dtype=np.bool_),
-        **state.arrays,
+        "replay/code_is_clear": clear,
+        "replay/following_is_clear": clear,
+        **given,
     }
     return AgentState(arrays=arrays, values={"classed": len(rewards), **state.values})
 
