@@ -26,7 +26,7 @@ from imagine_bench import cli, errors, registry
 from imagine_bench.cli import exit_code as main
 from imagine_bench.cli import tools
 from imagine_bench.errors import ImagineBenchError, UnknownNameError
-from imagine_bench.protocols.control import PRESETS
+from imagine_bench.protocols.presets import PRESETS
 from imagine_bench.recording import stream
 from imagine_bench.registry import AGENTS, TASKS, WORLD_MODELS
 from imagine_bench.registry.entries import AgentConfiguration, parse_configuration

@@ -33,8 +33,9 @@ from imagine_bench.cli.options import (
 )
 from imagine_bench.errors import InvalidValueError, RunFailedError
 from imagine_bench.interfaces import DEVICES
-from imagine_bench.protocols.control import PRESETS, Protocol
+from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import Encoders, Launcher, ProtocolData, Result, digest
+from imagine_bench.protocols.presets import PRESETS
 from imagine_bench.registry.entries import file_name, parse_settings
 from imagine_bench.running.bench import bench, load_so_far, plan
 from imagine_bench.running.headlines import until_decided

@@ -22,8 +22,9 @@ from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError, brief, require
 from imagine_bench.exact.certificate import Certificate
 from imagine_bench.interfaces.environments import Env
-from imagine_bench.protocols.control import PRESETS, Protocol
+from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import digest
+from imagine_bench.protocols.presets import PRESETS
 from imagine_bench.registry.entries import AgentEntry
 from imagine_bench.registry.machine import commit
 from imagine_bench.rules import fewest_actions

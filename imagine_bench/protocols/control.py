@@ -1,4 +1,4 @@
-"""The protocol of a bench of agents that act, and its presets: the agents, the task, the budgets and the tests."""
+"""The protocol of a bench of agents that act: the agents, the task, the budgets and the tests."""
 
 from __future__ import annotations
 
@@ -33,6 +33,7 @@ from imagine_bench.protocols.data import (
     package_digests,
     require_different,
 )
+from imagine_bench.protocols.presets import ALL_AGENTS, PRESETS
 from imagine_bench.registry import (
     AGENT_GROUP,
     agent_entry,
@@ -49,10 +50,6 @@ from imagine_bench.registry.entries import parse_configuration
 from imagine_bench.rules import facts
 from imagine_bench.seeding import SeedTree
 from imagine_bench.values import Setting
-
-_THESIS_AGENTS = ("dqn", "imagination", "imagination_uncertainty")
-_ALL_AGENTS = ("random", "oracle", *_THESIS_AGENTS)
-_THESIS_BUDGETS = (250, 500, 1000, 1500, 2000, 3000, 4000, 5000, 6000)
 
 TASK_CODE = "task "
 """Beginning of the names of tasks in :attr:`.ProtocolData.code`; no agent's name has a space."""
@@ -228,7 +225,7 @@ class Protocol(WorldSection, LearnerSection, BudgetSection, EvaluationSection, P
     A new option is a field of one section, checked there. Files and hashes have all fields side by side.
     """
 
-    agents: tuple[str, ...] = _ALL_AGENTS  #: Agents, also with settings of their own (:mod:`.entries`)
+    agents: tuple[str, ...] = ALL_AGENTS  #: Agents, also with settings of their own (:mod:`.entries`)
     seeds: tuple[int, ...] = (0, 1, 2)
 
     def __post_init__(self) -> None:
@@ -294,45 +291,6 @@ def spec_of(name: str, split: str | None, *, testing: bool) -> TaskSpec:
     found = split_of(spec.rules, split)
     rules = cast("Rules", StartingFrom(spec.rules, found.test if testing else found.train))
     return dataclasses.replace(spec, rules=rules, facts=partial(facts, rules, spec.horizon))
-
-
-PRESETS: dict[str, dict[str, Any]] = {
-    "smoke": {
-        "hyperparameters": "minimal", "seeds": (0,), "budgets": (10, 20), "evaluation_episodes": 20,
-        "open_loop_starts": 20, "recorded_episodes": 2,
-    },
-    "quick": {
-        "agents": ("random", "dqn", "dqn_more_updates", *_THESIS_AGENTS[1:], "factored:given", "oracle"),
-        "seeds": tuple(range(6)), "budgets": (250, 400), "evaluation_episodes": 100,
-        "few_seeds": {
-            "dqn_more_updates": 10, "imagination": 7, "dqn": 6,
-            "imagination_uncertainty": 1, "factored:given": 1, "random": 1, "oracle": 1,
-        },
-        "open_loop_starts": 20, "recorded_seeds": 1,
-        "headlines": (("imagination", "dqn"), ("imagination", "dqn_more_updates")),
-    },
-    "thesis": {
-        "hyperparameters": "published", "agents": _THESIS_AGENTS, "seeds": tuple(range(5)),
-        "budgets": _THESIS_BUDGETS, "evaluation_episodes": 1000,
-    },
-    "full": {
-        "hyperparameters": "published", "agents": _ALL_AGENTS, "seeds": tuple(range(20)),
-        "budgets": _THESIS_BUDGETS, "evaluation_episodes": 1000,
-    },
-    "sample_efficiency": {
-        "agents": ("factored:given",), "seeds": tuple(range(5)), "budgets": tuple(range(20, 201, 20)),
-        "evaluation_episodes": 1000, "recorded_episodes": 2,
-    },
-    "queries": {
-        "agents": ("factored:given",), "seeds": tuple(range(5)), "budgets": (10, 20, 30, 40, 60, 80, 100),
-        "evaluation_episodes": 100, "execution": "kinematic",
-        "open_loop_starts": 0, "recorded_episodes": 0,
-    },
-}  # fmt: skip
-"""The changes of each preset, except where a task has its own: ``smoke`` shows that everything works, ``quick`` is the
-default, ``thesis`` is tables 5.1-5.4 as printed, ``full`` has seeds enough to see the filter's gain (5 do not, by the
-thesis' own spreads), ``sample_efficiency`` counts the first episodes of agents that need few, ``queries`` does so
-in little time, to compare many ways of being taught."""
 
 
 def usual_agents(task_name: str, preset: str) -> tuple[str, ...]:

@@ -16,7 +16,8 @@ from matplotlib.figure import Figure
 
 from imagine_bench import reference
 from imagine_bench.arrays import Floats
-from imagine_bench.protocols.control import PRESETS, Protocol
+from imagine_bench.protocols.control import Protocol
+from imagine_bench.protocols.presets import PRESETS
 from imagine_bench.registry.entries import FIRST
 from imagine_bench.report import figures, sections
 from imagine_bench.report.data import (

@@ -12,8 +12,9 @@ import numpy as np
 from imagine_bench import registry
 from imagine_bench.data.folder import read_dataset, require_fits
 from imagine_bench.errors import InvalidValueError, UnknownNameError, brief, plain
-from imagine_bench.protocols.control import PRESETS, Protocol, context_of, protocol, usual_agents
+from imagine_bench.protocols.control import Protocol, context_of, protocol, usual_agents
 from imagine_bench.protocols.data import Encoders, RunSpec, TaskType, digest
+from imagine_bench.protocols.presets import PRESETS
 from imagine_bench.registry.entries import parse_configuration
 from imagine_bench.rules import states_of
 from imagine_bench.running import runner

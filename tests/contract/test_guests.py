@@ -21,7 +21,8 @@ import imagine_bench
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import InvalidValueError, SetupError
-from imagine_bench.protocols.control import PRESETS, protocol, usual_agents
+from imagine_bench.protocols.control import protocol, usual_agents
+from imagine_bench.protocols.presets import PRESETS
 from imagine_bench.registry.builtin import guests as own_guests
 from imagine_bench.running.control import plan_control
 from imagine_bench.store.files import sealed, write_json

@@ -19,7 +19,8 @@ import numpy as np
 
 from imagine_bench import statistics
 from imagine_bench.interfaces import Floats
-from imagine_bench.protocols.control import PRESETS, protocol
+from imagine_bench.protocols.control import protocol
+from imagine_bench.protocols.presets import PRESETS
 from imagine_bench.running.headlines import stages
 from imagine_bench.store.loading import load_so_far
 from imagine_bench.store.results import BenchResult

@@ -8,7 +8,8 @@ import pytest
 
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnableError
 from imagine_bench.interfaces import APPEARANCES
-from imagine_bench.protocols.control import PRESETS, Protocol, protocol
+from imagine_bench.protocols.control import Protocol, protocol
+from imagine_bench.protocols.presets import PRESETS
 from imagine_bench.registry import TASKS, task
 from imagine_bench.running.control import plan_control
 from imagine_bench.store import encoders
