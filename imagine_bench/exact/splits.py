@@ -75,6 +75,8 @@ def split_of(rules: Rules, text: str) -> Split:
     kind, _, rest = name.partition("=")
     try:
         numbers = [int(each) for each in rest.split(":")]
+        if kind == "values":  # whose order says nothing
+            numbers[1:] = sorted(set(numbers[1:]))
         is_test = _KINDS[kind](rules, *numbers)
         sides = {state: is_test(state) for state in rules.start_states}
     except InvalidValueError:  # which says more

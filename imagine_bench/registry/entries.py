@@ -213,7 +213,7 @@ def parse_options(text: str, kinds: Mapping[str, str], where: str) -> dict[str, 
 def read_mapping(file: Path) -> dict[str, Setting]:
     """A JSON file that holds one mapping. Raises ArtefactError: it does not, or cannot be read."""
     try:
-        found = json.loads(file.read_text(), object_pairs_hook=_each_once)
+        found = json.loads(file.read_text(), object_pairs_hook=each_once)
     except (OSError, ValueError, RecursionError) as error:
         raise ArtefactError(f"{file} cannot be read ({plain(error)}); give a JSON file of one mapping.") from error
     if not isinstance(found, dict):
@@ -221,7 +221,7 @@ def read_mapping(file: Path) -> dict[str, Setting]:
     return found
 
 
-def _each_once(pairs: Sequence[tuple[str, Setting]]) -> dict[str, Setting]:
+def each_once(pairs: Sequence[tuple[str, Setting]]) -> dict[str, Setting]:
     """The mapping of these pairs. Raises ValueError: a name is given twice, of which JSON would take the last."""
     found = dict(pairs)
     if len(found) < len(pairs):

@@ -13,6 +13,7 @@ import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -20,6 +21,7 @@ from imagine_bench import registry
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, brief, require_known, why
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import digest, require_seeds, require_types
+from imagine_bench.registry.entries import each_once
 from imagine_bench.seeding import TUNING_SEEDS, is_tuning_seed
 from imagine_bench.values import Setting, dotted
 
@@ -216,7 +218,8 @@ def read_grid(path: Path) -> Study | Suite:
         )
     try:
         text = path.read_text()
-        data = {"name": path.stem, **(json.loads(text) if path.suffix == ".json" else tomllib.loads(text))}
+        read = partial(json.loads, object_pairs_hook=each_once) if path.suffix == ".json" else tomllib.loads
+        data = {"name": path.stem, **read(text)}
         if "experiments" not in data:
             variants = [Variant(**{**each, "settings": _settings(each)}) for each in data["variants"]]
             return Study(**{**data, "variants": variants})

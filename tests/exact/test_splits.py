@@ -65,6 +65,8 @@ def test_a_split_has_no_second_name_and_names_no_value_that_no_start_has():
             InvalidValueError, match=r"^No start has the value (9|-1) of coordinate 3; .* \[0, 1, 2\]\.$"
         ):
             split_of(RULES, wrong)
+    for same in ("values=3:2:0", "values=3:0:2:0"):
+        assert split_of(RULES, same).identity == split_of(RULES, "values=3:0:2").identity
 
 
 def test_rules_with_fewer_starts_are_copied_and_pickled_and_are_the_rules_in_all_else():
@@ -77,7 +79,7 @@ def test_rules_with_fewer_starts_are_copied_and_pickled_and_are_the_rules_in_all
 
 
 def test_a_text_names_a_split():
-    for text in ("plan_length=2", "values=3:2:0", "pairs=0:3:2"):
+    for text in ("plan_length=2", "values=3:0:2", "pairs=0:3:2"):
         found = split_of(RULES, text)
         assert found.identity == f"{text}@{found.hash}"
         assert split_of(RULES, found.identity) == found

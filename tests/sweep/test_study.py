@@ -171,6 +171,10 @@ def test_a_study_from_a_file_changes_the_world_too(tmp_path: Path) -> None:
     ]  # fmt: skip
     (tmp_path / "mine.json").write_text(json.dumps(tomllib.loads(_FILE)))
     assert read_grid(tmp_path / "mine.json") == study
+    twice = json.dumps(tomllib.loads(_FILE)).replace("{", '{"name": "first", ', 1)
+    (tmp_path / "twice.json").write_text(twice[:-1] + ', "name": "second"}')
+    with pytest.raises(InvalidValueError, match="is given twice"):
+        read_grid(tmp_path / "twice.json")
     nested = 'settings = { controller.discount = 0.9, "controller.hidden" = [8, 8] }'
     path.write_text(f'{_FILE}[[variants]]\nname = "slow"\nagent = "dqn"\n{nested}\n')
     assert read_grid(path).variants[-1].settings == {"controller.discount": 0.9, "controller.hidden": (8, 8)}
