@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
+from fake_latents import built, live, make_dqn
 from imagine_bench.agents.replay import Batch, ImaginedMemory, RealMemory
 
 from imagine_bench.errors import InvalidValueError
@@ -71,6 +73,18 @@ def test_a_new_transition_is_drawn_first_and_priorities_come_back() -> None:
     for each in (memory, other):
         rows = each.sample_prioritised(2_000, draws(), exponent=1.0, correction=0.0).rows
         assert set(rows.tolist()) == {1, 3}
+
+
+def test_a_learner_replays_by_the_errors_that_it_had_last() -> None:
+    agent = built(make_dqn, {"memory.priority": 0.3, "memory.priority_correction": 0.8})
+    live(agent, range(6), np.random.default_rng(0))
+    generator = torch.Generator()
+    generator.set_state(torch.from_numpy(agent.state().arrays["generator/replay"]))
+    batch = agent.real.sample_prioritised(8, generator, exponent=0.3, correction=0.8)
+    agent.learn_values(agent.real, 1)
+    errors = agent.controller.errors(batch).abs()
+    kept = torch.from_numpy(agent.real.arrays()["error"])
+    assert all(kept[row] in errors[batch.rows == row] for row in batch.rows)
 
 
 @pytest.mark.parametrize("at_once", [4, 8])

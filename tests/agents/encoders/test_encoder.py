@@ -104,6 +104,17 @@ def test_thesis_loss_is_bernoulli_and_summed_over_pixels() -> None:
     torch.testing.assert_close(vae.elbo(batch, torch.zeros(3, 8), beta=4.0).reconstruction, expected, rtol=1e-4, atol=0)
 
 
+def test_images_are_drawn_at_the_usual_brightness_and_contrast() -> None:
+    """Those of the training images: their mean, and the mean deviation of pixels within a strip."""
+    vae = made_vae(TINY)
+    batch = images(5)
+    vae.fit_appearance(batch)
+    contrast = np.mean([strip.std() for strip in batch.flatten(0, 1).numpy()])
+    latents, _ = vae.posterior(batch)
+    usual = batch.mean() + contrast * vae.generate(latents)
+    torch.testing.assert_close(vae.decode(latents, 64, 22), usual.clamp(0.0, 1.0))
+
+
 def test_standardised_strips_do_not_see_light() -> None:
     strips = images(4).flatten(2)
     torch.testing.assert_close(standardise(0.3 + 0.5 * strips), standardise(strips), rtol=0.01, atol=0.01)
@@ -220,7 +231,7 @@ def test_a_gpu_repeats_itself_and_agrees_with_the_processor(recipe: Recipe) -> N
     assert on_gpu.card.versions["gpu"]
 
 
-def test_probes_read_frames_and_looks_that_training_never_saw() -> None:
+def test_probes_read_frames_and_looks_that_training_never_saw(tiny: Encoder) -> None:
     drawn: list[tuple[str, np.ndarray, np.ndarray]] = []
 
     def noted(macrostates: np.ndarray, appearance: str, rng: np.random.Generator) -> np.ndarray:
@@ -236,6 +247,9 @@ def test_probes_read_frames_and_looks_that_training_never_saw() -> None:
     mu, sigma = made.encode(drawn[1][2])
     information = 0.5 * (mu.square() + sigma.square() - 1.0 - 2.0 * sigma.log()).sum(dim=1).mean()
     assert made.card.kl_nats == pytest.approx(information.item(), abs=2e-3)
+    away = made.network.mean(mu) - made.network.target(torch.from_numpy(gray_cells(drawn[1][2])))
+    assert made.card.reconstruction == pytest.approx(away.square().mean().item(), rel=0.01)
+    assert tiny.card.probe["linear"] < tiny.card.probe["mlp_sampled"] < tiny.card.probe["mlp"]
     assert [(looks, len(seen)) for looks, _, seen in drawn] == [("photo", 60), ("photo_held_out", 30)]
     first, second = ({frame.tobytes() for frame in seen} for *_, seen in drawn)
     assert first.isdisjoint(second)
@@ -349,6 +363,7 @@ def test_retrain_leaves_three_files_and_never_overwrites(tmp_path: Path, monkeyp
     assert f"Wrote {path}" in text
     assert f"mlp {card.probe['mlp']:.2%}" in text
     assert (card.recipe.steps, card.recipe.batch, card.recipe.latents) == (QUICK.steps, 9, 11)
+    assert card.data.startswith("60 training and 30 held-out frames")
     command = "imagine-bench encoder --task drawn_arrows --appearance mild --recipe quick --seed 1"
     assert card.command == f"{command} --batch 9 --latents 11"
     with Image.open(path.with_suffix(".png")) as sheet:

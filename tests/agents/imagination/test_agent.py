@@ -8,7 +8,7 @@ from unittest import mock
 import numpy as np
 import pytest
 import torch
-from fake_latents import CODES, built, frame, live, make_dqn, transition
+from fake_latents import ACTIONS, CODES, built, frame, live, make_dqn, transition
 from imagine_bench.agents.dqn import DQN, epsilon
 from imagine_bench.agents.imagination import agent as imagination_agents
 from imagine_bench.agents.imagination import model_only
@@ -30,6 +30,9 @@ def test_one_seed_acts_alike_until_imagination_begins() -> None:
     agents = [built(make, {"imagination.start_episode": 8}) for make in MAKERS]
     histories = [live(agent, range(8), np.random.default_rng(0)) for agent in agents]
     assert all(history == histories[0] for history in histories)
+    for agent in agents:
+        counts = {count for name, (_, count) in agent.meters.state().items() if name.startswith("time/")}
+        assert counts == {len(histories[0])}, "CPU seconds are those of a real step"
 
     def weights() -> list[bytes]:  # the last two train a second controller
         return [agent.state().arrays["controller/network.0.weight/weight"].tobytes() for agent in agents[:3]]
@@ -105,21 +108,8 @@ def test_truncation_is_stored_as_alive_and_termination_as_ended() -> None:
     assert agent.real.arrays()["terminated"].tolist() == [0.0, 1.0]
 
 
-def test_a_dqn_beats_chance_on_a_small_contextual_task() -> None:
-    """Six contexts, three actions, one of them right: a random agent succeeds one time in three."""
-    agent = built(make_dqn, {"controller.hidden": (64, 64), "controller.batch_size": 32})
-    rng = np.random.default_rng(0)
-    for episode in range(250):
-        state = int(rng.integers(6))
-        action = agent.act(Observation(frame=frame(state)), explore=True)
-        reward = 1.0 if action == state % 3 else -1.0
-        agent.observe(transition(state, action, reward, 10, terminated=True), episode=episode)
-    right = [agent.act(Observation(frame=frame(state)), explore=False) == state % 3 for state in range(6)]
-    assert np.mean(right) >= 5 / 6  # chance 1 / 3; all six by luck: 1 in 729
-
-
 def test_imagine_follows_its_actions_and_its_generator() -> None:
-    trained = built(imagination_agents.make_uncertainty)
+    trained = built(model_only.make_uncertainty)  # it is tested with another controller than it explores with
     live(trained, range(4), np.random.default_rng(0))
     actions = np.array([0, 2, 1, 1])
     first, other = (
@@ -128,9 +118,27 @@ def test_imagine_follows_its_actions_and_its_generator() -> None:
     assert np.array_equal(first.actions, actions)
     assert first.epistemic.tolist() != other.epistemic.tolist()
     assert np.array_equal(first.q_values[0], trained.q_values(Observation(frame=frame(1))))
-    greedy = trained.imagine(frame(1), actions=None, depth=5, rng=np.random.default_rng(3))
-    assert np.array_equal(greedy.actions, greedy.q_values.argmax(axis=1))
-    assert (greedy.p_terminated[:-1] <= 0.5).all()
+    for logit, lengths in ((-99.0, [5, 4]), (99.0, [1, 4])):
+        with torch.no_grad():
+            trained.imagination.model.head.networks[1].biases[-1].fill_(logit)
+        greedy, given = (
+            trained.imagine(frame(1), actions=these, depth=5, rng=np.random.default_rng(3)) for these in (None, actions)
+        )
+        assert [len(greedy.actions), len(given.actions)] == lengths, "its own plan ends with the episode"
+        assert np.array_equal(greedy.actions, greedy.q_values.argmax(axis=1))
+
+
+def test_expected_outcomes_are_of_each_frame_and_macro_action() -> None:
+    certain = {"imagination.temperature": 0.0, "imagination.predicts_with": "network", "model.components": 1}
+    agent = built(imagination_agents.make, certain)
+    live(agent, range(4), np.random.default_rng(0))
+    frames = np.stack([frame(1), frame(4)])
+    found = agent.predict_outcomes(frames, np.random.default_rng(0))
+    for row, action in np.ndindex(2, ACTIONS):
+        one = agent.imagine(frames[row], actions=np.array([action]), depth=1, rng=np.random.default_rng(1))
+        assert found.reward[row, action] == pytest.approx(one.rewards[0])
+        assert (found.macrostates[row, action] == one.macrostates).all()
+        assert found.p_continues[row, action].sum() == (one.p_terminated[0] <= 0.5)
 
 
 def test_a_snapshot_that_does_not_fit_names_the_first_difference() -> None:

@@ -62,7 +62,7 @@ DRAWN = (
     *(("ArrowPuzzle", level, 64) for level in ("clean", "mild", "strong", "patched", "harsh")),
     *(("PickPlace", level, 64) for level in ("clean", "mild", "strong", "patched")),
     *(("ArrowPuzzle", f"{factor}=0.4", 64) for factor in FACTORS),
-    *(("ArrowPuzzle", f"{nuisance}=1.5", 64) for nuisance in NUISANCES),
+    *(("ArrowPuzzle", f"{nuisance}=2", 64) for nuisance in NUISANCES),
     ("ArrowPuzzle", "shift=1.5,occlusion=1.5", 128),
 )
 

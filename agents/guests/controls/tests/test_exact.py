@@ -31,7 +31,7 @@ HALF = 2
 def outcomes(state: tuple[int, ...], action: int) -> tuple[Outcome, ...]:
     moves = [(0.5, 2), (0.5, 0)] if action == HALF else [(1.0, action)]
     return tuple(
-        Outcome(p, ((state[0] + by) % STATES,), 7.0 if (state[0] + by) % STATES == GOAL else -1.0,
+        Outcome(p, ((state[0] + by) % STATES,), 70.0 if (state[0] + by) % STATES == GOAL else -1.0,
                 (state[0] + by) % STATES == GOAL, (state[0] + by) % STATES == GOAL)
         for p, by in moves
     )  # fmt: skip
@@ -109,14 +109,14 @@ def test_the_exact_filter_keeps_what_is_right() -> None:
     agent = built(exact.make_filter, exact_world=WORLD)
     assert isinstance(agent, ExactFilterAgent)
     rows = [  # from state 4: action, reached, reward, probability of the end; and whether that is right
-        (1, 5, 7.4, 0.9, True),
-        (1, 5, 9.0, 0.9, False),
-        (1, 5, 7.0, 0.1, False),
+        (1, 5, 76.0, 0.9, True),
+        (1, 5, 78.0, 0.9, False),
+        (1, 5, 70.0, 0.1, False),
         (1, 4, -1.0, 0.1, False),
         (0, 4, -1.9, 0.1, True),
         (HALF, 4, -1.0, 0.1, True),
         (HALF, 0, -1.0, 0.2, True),
-        (HALF, 5, 7.0, 0.9, False),
+        (HALF, 5, 70.0, 0.9, False),
     ]
     action, reached, reward, ends, right = (list(column) for column in zip(*rows, strict=True))
     step = ImaginedStep(CODES[reached] + 0.01, torch.tensor(reward), torch.tensor(ends), None, None)  # type: ignore[arg-type]

@@ -3,11 +3,26 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
+from counting_model import CPU, CountingModel
 from imagine_bench.agents.imagination.mixture import Mixture
-from imagine_bench_controls.signals import InfopropLimits, lost_information, moments, round_trip
+from imagine_bench.agents.imagination.rollouts import Imagination, ImaginedStep, Weights
+from imagine_bench.agents.imagination.settings import ImaginationSettings, Settings
+from imagine_bench_controls.signals import (
+    InfopropImagination,
+    InfopropLimits,
+    RoundTripImagination,
+    SpreadImagination,
+    lost_information,
+    moments,
+    round_trip,
+)
+
+from imagine_bench.seeding import SeedTree
 
 
 def bits(variance: float) -> float:
@@ -64,3 +79,41 @@ def test_the_round_trip_is_measured_by_the_motion() -> None:
     before = torch.tensor([[0.0, 0.0], [3.0, 2.0]])
     assert round_trip(z, again, before).tolist() == pytest.approx([0.0, 5.0 / 2.0])
     assert round_trip(z, again, z)[1].item() == pytest.approx(5.0 / math.sqrt(2.0) / 1e-3), "of no motion at least this"
+
+
+def made(kind: type[Imagination], **attributes: Any) -> Any:
+    settings = Settings(imagination=ImaginationSettings(temperature=0.0))
+    imagination = kind(2, 2, settings, filtered=False, seeds=SeedTree(0), device=CPU)
+    vars(imagination).update(model=CountingModel(), **attributes)
+    return imagination
+
+
+def stepped(imagination: Any, z: list[list[float]]) -> ImaginedStep:
+    return imagination.step(
+        torch.tensor(z), torch.zeros(len(z), dtype=torch.int64), Weights(None, None), torch.Generator()
+    )
+
+
+def test_each_uncertainty_is_that_of_its_own_futures() -> None:
+    """Every step adds (0, 1); three futures of each of two questions, whose first latents have variances 6 and 0."""
+    z = [[0.0, 0.0], [3.0, 0.0], [6.0, 0.0], *[[1.0, 1.0]] * 3]
+    there_and_back = SimpleNamespace(round_trip=lambda z: z + torch.tensor([0.0, 3.0]))
+    for imagination, wanted in (
+        (made(SpreadImagination, futures=3), [3.0] * 3 + [0.0] * 3),
+        (made(RoundTripImagination, encoder=there_and_back), [3.0] * 6),
+    ):
+        found = imagination.uncertainties(stepped(imagination, z))["epistemic"]
+        assert found.tolist() == pytest.approx(wanted)
+
+
+@pytest.mark.parametrize(
+    ("of_step", "of_rollout", "kept"), [((1, 2), (5, 6), True), ((9, 1), (9, 9), False), ((9, 9), (4, 9), False)]
+)
+def test_infoprop_stops_where_one_or_all_steps_lose_too_much(of_step: Any, of_rollout: Any, kept: bool) -> None:
+    """Of a step that loses 1 bit of one dimension and 2 of the other, after 4 of each."""
+    imagination = made(InfopropImagination)
+    step = stepped(imagination, [[0.0, 0.0]])
+    nothing = imagination.lost(step)[0] - torch.tensor([1.0, 2.0])
+    imagination.limits = InfopropLimits(nothing, torch.tensor(of_step) + 0.1, torch.tensor(of_rollout) + 0.1)
+    assert imagination.uncertainties(step)["epistemic"].item() == pytest.approx(3.0, abs=1e-4)
+    assert imagination.keeps(step, torch.full((1, 2), 4.0)).tolist() == [kept]

@@ -8,7 +8,7 @@ import pytest
 from fake_codes import ACTIONS, frame, live, starts
 from fake_pictures import played
 from imagine_bench_controls.tabular.agent import ReadState, read_codes, read_macrostate
-from imagine_bench_controls.tabular.count_table import CodeCountTableAgent
+from imagine_bench_controls.tabular.count_table import CodeCountTableAgent, CountTableAgent
 from imagine_bench_controls.tabular.counts import CountTable
 from imagine_bench_controls.tabular.dyna_q import DynaQAgent
 from imagine_bench_controls.tabular.own import OwnCountTableAgent
@@ -126,6 +126,20 @@ def test_directed_exploration_ends_in_greedy_actions() -> None:
         values = learner.q_values(seen)
         assert values[learner.act(seen, explore=True)] == pytest.approx(values.max())
     assert fake_codes.success(learner) == 1.0
+    told = learner.predict_outcomes(np.stack([frame(code) for code in starts()]), np.random.default_rng(0))
+    for row, action in np.ndindex(told.reward.shape):
+        following, reward, ended = fake_codes.step(starts()[row], action)
+        assert (told.reward[row, action], told.p_continues[row, action].tolist()) == (reward, [1.0 - ended])
+        assert ended or told.macrostates[row, action].tolist() == [list(following)]
+
+
+@pytest.mark.parametrize(("discount", "best"), [(0.5, 10.0), (1.0, 5000.0)])
+def test_what_is_untried_is_worth_the_best_return_to_who_explores(discount: float, best: float) -> None:
+    settings = HYPERPARAMETERS.resolve("fast", {"controller.discount": discount}, "chapter_5")
+    learner = CountTableAgent(read_macrostate, 2, settings, SeedTree(0), directed=True)
+    learner.observe(moved(0, 0, 5.0, 1, ended=True), episode=0)
+    explored, tested = ([learner.values(at(state), explore=how).tolist() for state in (0, 7)] for how in (True, False))
+    assert explored == [[5.0, best], [best, best]] and tested == [[5.0, 0.0], [0.0, 0.0]]
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0])

@@ -85,6 +85,21 @@ def test_the_target_follows_the_critic(monkeypatch: pytest.MonkeyPatch) -> None:
         torch.testing.assert_close(target.detach(), before + share * (number - before))
 
 
+def test_settings_reach_the_part_that_they_name() -> None:
+    """The first step of Adam moves weights by at most the learning rate, and some by nearly that."""
+    given = {"discount": 0.9, "return_decay": 0.8, "entropy": 0.01}
+    rates = {"actor": 1e-3, "critic": 1e-5}
+    agent = learner(learning_starts=1000, **given, **{f"{part}_learning_rate": rate for part, rate in rates.items()})
+    algo = agent.config.algo
+    assert [algo.gamma, algo.lmbda, algo.actor.ent_coef] == [*given.values()]
+    episode(agent, 0)
+    before = agent.state().arrays
+    agent.update()
+    moved = {name: np.abs(agent.state().arrays[name] - before[name]).max() for name in before if "/weight" in name}
+    for part, rate in rates.items():
+        assert max(moved[name] for name in moved if name.startswith(part)) == pytest.approx(rate, rel=0.1)
+
+
 def test_it_sees_latents_where_there_is_an_encoder() -> None:
     file = bundled_encoder("arrow_puzzle-clean")
     agent = learner(encoder=file, learning_starts=2)

@@ -104,8 +104,8 @@ def test_goals_are_read_again_after_an_update(monkeypatch: pytest.MonkeyPatch) -
     assert read == [goals, 1, 1], "the network is the same"
 
 
-def planner(model: torch.nn.Module, horizon: int) -> LeWMPlanner:
-    agent = learner(horizon=horizon, learning_starts=100)
+def planner(model: torch.nn.Module, horizon: int, **overrides: Any) -> LeWMPlanner:
+    agent = learner(horizon=horizon, learning_starts=100, **overrides)
     agent.network = model
     agent.goals = [seen(GOAL).frame]
     return agent
@@ -120,6 +120,14 @@ def test_plans_lead_to_the_nearest_goal_at_whichever_step() -> None:
     agent.goals = [seen(0).frame, seen(3).frame]
     agent.goal_latents = None
     assert moved(2, agent.act(seen(2), explore=False)) in {1, 3}, "the one that is one away, or on the way to the other"
+
+
+def test_exploration_falls_in_a_line_to_its_final_share() -> None:
+    agent = planner(Exact(), 1, exploration_steps=10, exploration_final_eps=0.5)
+    agent.updates = 1
+    for agent.steps, epsilon in ((0, 1.0), (5, 0.75), (10, 0.5)):
+        best = [agent.act(seen(GOAL - 1), explore=True) == 2 for _ in range(300)]
+        assert np.mean(best) == pytest.approx(1.0 - epsilon * 2 / 3, abs=0.09)
 
 
 class Detour(torch.nn.Module):

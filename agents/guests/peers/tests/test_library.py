@@ -82,6 +82,11 @@ def test_its_loop_is_counted_and_tested_and_leaves_no_temporary_files(
         assert last.diagnostics["loss/dynamics"] and "imagination/acceptance_rate" in last.diagnostics
 
 
+def test_it_learns_from_whatever_the_protocol_shows(tmp_path: Path) -> None:
+    result = do(tmp_path / "run", "sb3_dqn", observation="proprio,state")
+    assert result.checkpoints[-1].diagnostics["gradient_updates"] > 0
+
+
 @pytest.mark.parametrize("explore", [False, True])
 def test_it_acts_greedily_unless_it_explores(explore: bool) -> None:
     from imagine_bench_peers.sb3 import LibraryAgent
