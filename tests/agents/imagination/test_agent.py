@@ -108,6 +108,19 @@ def test_truncation_is_stored_as_alive_and_termination_as_ended() -> None:
     assert agent.real.arrays()["terminated"].tolist() == [0.0, 1.0]
 
 
+def test_a_dqn_beats_chance_on_a_small_contextual_task() -> None:
+    """Six contexts, three actions, one of them right: a random agent succeeds one time in three."""
+    agent = built(make_dqn, {"controller.hidden": (64, 64), "controller.batch_size": 32})
+    rng = np.random.default_rng(0)
+    for episode in range(250):
+        state = int(rng.integers(6))
+        action = agent.act(Observation(frame=frame(state)), explore=True)
+        reward = 1.0 if action == state % 3 else -1.0
+        agent.observe(transition(state, action, reward, 10, terminated=True), episode=episode)
+    right = [agent.act(Observation(frame=frame(state)), explore=False) == state % 3 for state in range(6)]
+    assert np.mean(right) >= 5 / 6  # chance 1 / 3; all six by luck: 1 in 729
+
+
 def test_imagine_follows_its_actions_and_its_generator() -> None:
     trained = built(model_only.make_uncertainty)  # it is tested with another controller than it explores with
     live(trained, range(4), np.random.default_rng(0))

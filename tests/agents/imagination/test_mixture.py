@@ -90,3 +90,24 @@ def test_an_ensemble_predicts_with_all_its_members_components() -> None:
     assert pooled.means.tolist() == [[[0.0], [10.0], [10.0], [0.0]], [[1.0], [11.0], [11.0], [1.0]]]
     torch.testing.assert_close(pooled.log_weights.exp(), torch.full((2, 4), 0.25))
     torch.testing.assert_close(pooled.log_sigmas, torch.full((2, 4, 1), -3.0))
+
+
+@pytest.mark.parametrize(("components", "least", "most"), [(6, 0.0, 0.25), (1, 0.5, 1.0)])
+def test_a_mixture_holds_several_outcomes_and_one_gaussian_does_not(components: int, least: float, most: float) -> None:
+    """A coin of three sides, at -2, 0 and 3: a fit by its likelihood is off by this total variation."""
+    sides = torch.tensor([-2.0, 0.0, 3.0])
+    shares = torch.tensor([0.5, 0.3, 0.2])
+    draws = torch.Generator().manual_seed(0)
+    outputs = torch.randn(mdn.output_size(components, 1), generator=draws).requires_grad_()
+    optimizer = torch.optim.SGD([outputs], lr=0.2)
+    for _ in range(600):
+        optimizer.zero_grad()
+        fitted = mdn.from_outputs(outputs, components, 1, log_sigma_floor=-2.0)
+        loss = -shares @ mdn.log_likelihood(fitted, sides[:, None])
+        loss.backward()
+        optimizer.step()
+    many = fitted.map(lambda part: part.detach().expand(2_000, *part.shape))
+    near = (mdn.sample(many, 1.0, draws) - sides).abs() < 0.6  # [samples, sides]
+    read = near.double().mean(dim=0)
+    away = 0.5 * float((read - shares).abs().sum() + 1.0 - read.sum())
+    assert least <= away <= most

@@ -17,7 +17,7 @@ from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import State
 
-pytest.importorskip("stable_baselines3")
+sb3 = pytest.importorskip("stable_baselines3")
 TASK = registry.task("arrow_puzzle")
 
 
@@ -48,6 +48,33 @@ def test_one_imagined_episode_ends_as_in_the_vector() -> None:
     assert kinds == {(False, False, True), (True, False, True), (False, True, True), (False, True, False)}
     with pytest.raises(InvalidValueError, match="has 2 episodes side by side; give one of num_envs 1"):
         ImaginedEnv(ImaginedVectorEnv(ruled(TASK), RuledModel(TASK).encode(TASK.rules.states).numpy(), num_envs=2))
+
+
+def success_rate(model: Any) -> float:
+    """Of the greedy policy, from every start, by the rules."""
+    code = RuledModel(TASK)
+    solved = 0
+    for start in TASK.rules.start_states:
+        state: State = start
+        for _ in range(TASK.horizon):
+            action, _ = model.predict(code.encode([state])[0].numpy(), deterministic=True)
+            (outcome,) = TASK.rules.outcomes(state, int(action))
+            state = outcome.macrostate
+            if outcome.terminated:
+                solved += outcome.success
+                break
+    return solved / len(TASK.rules.start_states)
+
+
+@pytest.mark.slow
+def test_dqn_that_only_imagines_the_true_rules_solves_the_task() -> None:
+    model = sb3.DQN(
+        "MlpPolicy", puzzle(), learning_rate=1e-3, gamma=0.95, learning_starts=200, train_freq=1, gradient_steps=1,
+        target_update_interval=500, exploration_fraction=0.5, buffer_size=20_000, seed=0, device="cpu",
+    )  # fmt: skip
+    untrained = success_rate(model)
+    model.learn(12_000)
+    assert untrained < 0.2 and success_rate(model) > 10 * TASK.facts().chance_level
 
 
 class Ring(gymnasium.Env[Any, Any]):
