@@ -134,10 +134,19 @@ def test_no_p_value_is_below_the_chance_of_two_groups(runs: tuple[int, int]) -> 
 
 
 def test_equal_runs_differ_by_more_than_their_tests() -> None:
-    far = statistics.difference([1.0] * 5, [0.16] * 5, trials=200)
-    assert far.value == 0.84 and far.p < 0.01 and 0.7 < far.low < 0.84 < far.high
-    near = statistics.difference([1.0] * 5, [0.999] * 5, trials=200)
-    assert near.p > 0.2
+    """Five runs of 200 tests have the error of 1,000 tests, by Agresti and Coull's share (1998)."""
+    ones, few = [1.0] * 5, [0.16] * 5
+    errors = np.array([math.sqrt(p * (1.0 - p) / 1000) for p in (1002 / 1004, 162 / 1004)])
+    both, welch = math.hypot(*errors), (errors**2).sum() ** 2 / (errors**4 / 4).sum()
+    freedom = (welch + 4) / 2
+    half = stats.t.ppf(0.975, freedom) * both
+    assert statistics.difference(ones, few, trials=200) == pytest.approx((0.84, 0.84 - half, 0.84 + half, 2 / 2**10))
+    least = both * (stats.t.isf(0.05 / 6, freedom) + stats.t.ppf(0.8, freedom))
+    assert statistics.detectable(ones, few, cells=3, trials=200) == pytest.approx(least)
+    for end in statistics.ratio(ones, few, trials=200)[1:3]:
+        assert abs(1.0 - end * 0.16) == pytest.approx(
+            stats.t.ppf(0.975, welch) * math.hypot(errors[0], end * errors[1])
+        )
     assert statistics.difference([0.5] * 6, [0.5] * 6) == (0.0, 0.0, 0.0, 1.0), "all alike"
 
 

@@ -165,7 +165,7 @@ def _record(data: ReportData, agent: str, place: int, fewest: Callable[[State], 
             beyond.append(int(kept.lengths[test]) - fewest(tuple(kept.starts[test].tolist())))
     if beyond:
         record["excess_macro_actions"] = mean(beyond)
-    if agent in data.learners and data.installed:
+    if agent in data.learners and data.installed and not math.isnan(data.facts.chance_level):
         areas = statistics.running_means(protocol.budgets, shares, data.facts.chance_level)[:, place]
         area = (statistics.iqm(areas), *statistics.interval(areas, trials=trials))
         record |= zip(AREA, area, strict=True)

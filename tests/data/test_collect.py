@@ -139,6 +139,8 @@ def test_the_command_collects_and_describes(tmp_path: Path, capsys: pytest.Captu
     said = capsys.readouterr().out
     assert main(["dataset", "--describe", str(out)]) == 0
     assert capsys.readouterr().out == said.partition("\n")[2], "the read dataset is the written one"
+    rewards = read_dataset(out).episodes.rewards
+    assert f"\nreturn        {rewards.sum() / 2:.2f} an episode\n" in said
     assert describe(read_dataset(out)) in said and "100.0% of episodes [34.2%" in said and "chance 4.6%" in said
     assert main([*words, "--out", str(out)]) == 2
     assert f"{out} exists; give another folder with --out. Nothing was written." in capsys.readouterr().err

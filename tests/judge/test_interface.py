@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
+import math
 import re
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from bench_fakes import RulesImaginer
 from fake_reader import BlindReader
 from judged import Altered, asked_pairs, judged_world
 from same_values import assert_same
+from small_runs import context
 
 from imagine_bench import registry
 from imagine_bench.arrays import Ints
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Frame, State
+from imagine_bench.interfaces.capabilities import ImaginedRollout
 from imagine_bench.interfaces.episodes import Episodes, joined
 from imagine_bench.interfaces.model import Imagined, require_imagined, weights_of
 from imagine_bench.judge import questions
+from imagine_bench.judge.models import AgentModel
 from imagine_bench.judge.predictions import Predictions, ask_together, evaluate
 from imagine_bench.judge.questions import EvalSet
 
@@ -71,17 +78,21 @@ def test_questions_come_shuffled_and_each_answer_is_put_back() -> None:
     assert after is not None
     sets = {"one_step": world.one_step, "rollouts": world.rollouts, "after": after}
     batches: list[list[State]] = []
+    imagined: list[int] = []
 
     def noted(found: Imagined, frames: Frame, actions: Ints) -> Imagined:
         """The model keeps its questions, and spoils them."""
         batches.append([state for state, _ in asked_pairs(world, frames, actions)])
         frames[...] = 0
         actions[...] = 0
+        imagined.append(math.prod(found.pictures.shape[:3]))
         return found
 
     def answered(order: int | None) -> tuple[dict[str, Predictions], list[list[State]]]:
         batches.clear()
+        clock_s = map(float, itertools.count())  # a second a batch
         given: dict[str, Any] = {"samples": 2, "reader": BlindReader(4), "index": world.index}
+        given["cpu_clock"] = lambda: next(clock_s)
 
         def ask(asked: EvalSet, name: str) -> Predictions:
             drawn = None if order is None else np.random.default_rng(order)
@@ -89,6 +100,9 @@ def test_questions_come_shuffled_and_each_answer_is_put_back() -> None:
 
         return ask_together(ask, sets), [*batches]
 
+    (first, _), steps = answered(None), sum(imagined)
+    assert sum(each.steps for each in first.values()) == pytest.approx(steps, abs=1)
+    assert sum(each.cpu_s for each in first.values()) == pytest.approx(len(batches))
     (plain, in_order), (one, shuffled), (again, repeated), (other, otherwise) = map(answered, (None, 0, 0, 1))
     assert in_order != shuffled == repeated != otherwise
     for name, answers in plain.items():
@@ -98,6 +112,31 @@ def test_questions_come_shuffled_and_each_answer_is_put_back() -> None:
                 assert_same(getattr(answers, field), getattr(each[name], field))
     over = [world.spec.rules.is_terminal(state) for state in shuffled[0]]
     assert any(over) and not all(over), "a batch does not tell that it is about frames after an end"
+
+
+def test_an_agents_rollouts_are_the_futures_of_a_world_model() -> None:
+    """From the latest of three frames, by the two actions behind those between; each ends it with probability 0.1."""
+    luck: list[float] = []
+
+    def imagine(frame: Frame, *, rng: np.random.Generator, **asked: Any) -> ImaginedRollout:
+        """Its frame, rewards that number actions, and a filter that keeps the first in half and the second in less."""
+        rollout = RulesImaginer(context()).imagine(frame, rng=rng, **asked)
+        kept = np.array([2, 1]) > len(luck) % 4
+        luck.append(rng.random())
+        images = np.full((2, 64, 64), frame[0, 0, 0] / 255)
+        told = {"rewards": 1.0 * rollout.actions, "epistemic": np.full(2, luck[-1]), "aleatoric": np.zeros(2)}
+        return dataclasses.replace(rollout, frames=images, accepted=kept, **told)
+
+    frames = np.arange(6, dtype=np.uint8).reshape(2, 3, 1, 1, 1).repeat(64, 2).repeat(64, 3).repeat(3, 4)
+    agent: Any = SimpleNamespace(imagine=imagine)
+    asked = np.array([[5, 5, 1, 2], [4, 4, 3, 0]])
+    found = vars(AgentModel(agent).imagine(frames, asked, 4, np.random.default_rng(0)))
+    assert (found["pictures"].mean(axis=(3, 4)).T == [2, 5]).all() and len(set(luck)) == 8
+    for row, rewards in enumerate(([1.0, 1.8], [3.0, 0.0])):
+        assert found["rewards"][row] == pytest.approx(np.tile(rewards, (4, 1)))
+        assert found["accepted"][row].tolist() == [True, False]
+        assert found["epistemic"][row] == pytest.approx([np.mean(luck[4 * row : 4 * row + 4])] * 2)
+    assert found["aleatoric"] is None, "an uncertainty that is 0 everywhere is not offered"
 
 
 def test_the_first_transitions_are_the_same_ones() -> None:

@@ -124,8 +124,6 @@ def right() -> list[PlanResult]:
 
 
 def test_optimal_plans_are_solved_without_a_second_look(right: list[PlanResult]) -> None:
-    assert all(plan.optimal and plan.as_imagined.all() and plan.done == plan.length for plan in right)
-    assert len({plan.shortest for plan in right}) >= 2
     assert [plan.done for plan in right] == [fewest_actions(TASK.rules, plan.start) for plan in right]
     dreamer = optimal()
     carried_out(dreamer, 3)
@@ -141,8 +139,6 @@ def test_every_plan_is_written_and_stops_with_its_episode(
     outcomes = [plan.outcome for plan in (*wrong, *right)]
     written = [(tmp_path / name).read_text() for name in ("plans.csv", "summary.json")]
     expected("plans", "\n".join([*written, *outcomes, rounded(summarise(right))]))
-    solved = [row["solved"] for row in csv.DictReader(written[0].splitlines())]
-    assert len(solved) == 12 and summarise(wrong)["solved"] == solved.count("1") < 6
     (tmp_path / "recording.rrd").write_text("old")
     write_plans(tmp_path, right[:1], TASK, {})
     assert sorted(path.name for path in tmp_path.iterdir()) == ["plans.csv", "plans.png", "summary.json"]
@@ -252,6 +248,7 @@ def test_a_plan_is_compared_with_what_its_frames_show(first: bool, lag: int) -> 
     plans = Trained(agent=agent, spec=whose, task=registry.task(name), episodes=7, folder=Path("somewhere"))
     with closing(make_env(plans, "kinematic")) as agent.env:
         plan = carry_out(agent.env, plans, 0)
+    assert plan.outcome == "over before anything was solved"
     states = [plan.start]
     for action in plan.compared.rollout.actions.tolist():
         states.append(plain.rules.outcomes(states[-1], action)[0].macrostate)

@@ -265,6 +265,9 @@ def test_known_mistakes_are_charged_exactly() -> None:
     assert scores["outcome_brier"] == pytest.approx(2 * share)
     assert wrong == {pairs[row // FRAMES] for row in scores["worst"][: FRAMES * len(wrong)]}
     assert scores["auroc_wrong"] == scores["best_skill"] == scores["filter_skill"] == 1.0
+    rows, count = FRAMES * len(wrong), FRAMES * len(pairs)
+    uncertain = [(k - count + rows) / k for k in range(count - rows + 1, count + 1)]
+    assert scores["risk_coverage"] == pytest.approx(sum(uncertain) / count)
     assert (scores["filter_keeps"], scores["filter_error"]) == (pytest.approx(1.0 - share), 0.0)
     answers = world.predictions(mistaken(world, wrong), world.one_step)
     unknown = one_step_scores(world.spec, world.one_step, answers, None)
@@ -285,10 +288,15 @@ def test_the_value_of_a_filter_is_the_cost_of_mistakes() -> None:
     assert 0.0 < scores["value_of_abstaining"] <= scores["value_of_filter"] + 1e-9
 
 
-def test_rewards_are_judged_as_outcomes() -> None:
+def test_rewards_and_ends_are_judged_as_outcomes() -> None:
     world = judged_world("pick_place")
-    scores = world.scores(changed(world, rewards=4.9))
-    wrong = [not any(reward == 5.0 for _, reward in steps[0].values()) for steps in world.one_step.truth]
+    scores = world.scores(changed(world, rewards=4.9, p_ended=0.75))
+    outcomes = [steps[0] for steps in world.one_step.truth]
+    wrong = [not any(reward == 5.0 for _, reward in each.values()) for each in outcomes]
+    ended = np.array([sum(share for (_, over), (share, _) in each.items() if over) for each in outcomes])
+    assert scores["end_error"] == pytest.approx(np.mean(np.abs(0.75 - ended)))
+    assert scores["end_brier"] == pytest.approx(np.mean((0.75 - ended) ** 2))
+    assert scores["end_ece"] == pytest.approx(abs(0.75 - ended.mean()))
     assert scores["reward_ece"] == pytest.approx(np.mean(wrong))
     assert scores["reward_brier"] == pytest.approx(2.0 * np.mean(wrong))
 
@@ -315,14 +323,17 @@ def test_rewards_of_a_later_step_are_judged_from_where_it_began() -> None:
 
 
 def test_noise_is_told_apart_where_most_of_the_world_is_certain() -> None:
-    """By an uncertainty that is 1 where several macrostates may follow, and 0 elsewhere."""
+    """By uncertainties that are 1 where several macrostates may follow, and 0 elsewhere; it imagines one future."""
     world = judged_world("pick_place")
 
-    def knowing(found: Imagined, frames: Frame, actions: Ints) -> Imagined:
+    def knowing(_: Imagined, frames: Frame, actions: Ints) -> Imagined:
         pairs = asked_pairs(world, frames, actions)
         noisy = np.array([len(world.spec.rules.outcomes(*pair)) > 1 for pair in pairs], dtype=np.float64)
-        return dataclasses.replace(found, aleatoric=np.repeat(noisy[:, None], found.pictures.shape[2], axis=1))
+        still = STILL.imagine(frames, actions, 1, np.random.default_rng(0))
+        known = np.repeat(noisy[:, None], actions.shape[1], axis=1)
+        return dataclasses.replace(still, aleatoric=known, modal=known)
 
     random = [len(steps[0]) > 1 for steps in world.one_step.truth]
     assert 0.0 < np.mean(random) < 0.5
-    assert world.scores(Altered(world, knowing))["auroc_noisy"] == 1.0
+    scores = world.scores(Altered(world, knowing))
+    assert scores["auroc_noisy"] == scores["auroc_several"] == 1.0

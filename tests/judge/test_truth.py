@@ -33,6 +33,8 @@ THREE = {(1,): 0.5, (2,): 0.3, (3,): 0.2}
         (HALVES, {(1,): 0.91, (2,): 0.09}, 0.41, 1, 0),
         (HALVES, {(1,): 0.48, (2,): 0.48, (3,): 0.04}, 0.04, 0, 0),  # below the least of a mode
         (THREE, {(1,): 1.0}, 0.5, 2, 0),
+        ({(1,): 0.95, (2,): 0.05}, {(1,): 0.95, (3,): 0.05}, 0.05, 1, 1),  # just a mode
+        (HALVES, {(1,): 0.9, (2,): 0.1}, 0.4, 0, 0),  # just a fifth of 0.5
     ],
 )
 def test_distances_are_those_computed_by_hand(

@@ -10,6 +10,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,6 +40,7 @@ from imagine_bench.judge.worlds.making import LOOK, QUERIES, WorldQuestions, wor
 from imagine_bench.judge.worlds.scores import GRAPH, MARGIN, graph_scores, scores_right, world_scores
 from imagine_bench.judge.worlds.tables import Transitions, TransitionTable, likelihood
 from imagine_bench.judge.worlds.words import NO, Named, Words
+from imagine_bench.report.worlds import worlds_section
 from imagine_bench.rules import Dynamics, Rules, states_of_play
 
 SLIPS = "arrows:cubes=2,slip=0.2"
@@ -310,6 +312,23 @@ def test_members_of_a_pair_differ_in_one_cause_and_both_must_be_right(task: str)
     half_blind[:, :, 1] = np.roll(half_blind[:, :, 1], 1, axis=-1)  # wrong in every second frame
     scores = world_scores(asked, dataclasses.replace(asked.truth, by_frame=half_blind))
     assert scores["only the look"]["right"] < 0.2 < scores["only the look"]["exact"]
+
+
+def test_a_family_that_copying_answers_is_marked_and_each_graph_counted() -> None:
+    def cell(right: float, **graph: dict[str, float]) -> dict[str, Any]:
+        plan = {"right": right, "copy": 0.53, "chance": 0.5, "exact": 0.9}
+        return {"worlds": {"shortest plan": plan, "only the look": {**plan, "copy": 0.51}, **graph}}
+
+    learned = {GRAPH: {"edges_wrong": 3.0, "edges": 7.0}}
+    cells = {"exact": [cell(0.9)], "mine": [cell(right, **learned) for right in (0.4, 0.5, 0.6, 1.0)]}
+    section = worlds_section({**cells, "theirs": [cell(0.2)], "older": [{}]}, {"mine": "my model", "theirs": "theirs"})
+    (table,) = section.tables  # type: ignore[union-attr]
+    assert [table.header, *table.rows] == [
+        ["family", "chance", "copy", "exact", "my model", "theirs"],
+        ["shortest plan *", "50.0", "53.0", "90.0", "55.0", "20.0"],
+        ["  only the look", "50.0", "51.0", "90.0", "55.0", "20.0"],
+        ["factor graph: wrong edges", "–", "7", "0", "3", "–"],
+    ]
 
 
 def test_the_hamming_distance_counts_edges_under_any_names() -> None:

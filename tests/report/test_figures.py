@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from fake_results import DEPTH, WIDE, bench_result
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgb
 
 from imagine_bench import registry
@@ -39,11 +40,19 @@ def test_the_success_figure_draws_scores_bands_and_the_thesis(data: ReportData) 
     (axes,) = success_figure(data).axes
     for agent in WIDE.agents:
         assert [(row["episodes"], 100.0 * row["success_iqm"]) for row in data.of(agent)] in lines(axes)
-    assert len(axes.collections) >= len(WIDE.agents)
+    for agent, band in zip(WIDE.agents, axes.collections, strict=False):  # three seeds: from the lowest to the highest
+        runs = [[(row.episodes, 100.0 * row.success_rate) for row in run.checkpoints] for run in data.result.of(agent)]
+        assert all(each in lines(axes) for each in runs), "thin lines"
+        ends = {(x, end(y)) for x, *y in zip(WIDE.budgets, *np.array(runs)[:, :, 1], strict=True) for end in (min, max)}
+        assert {(x, y) for path in band.get_paths() for x, y in path.vertices.tolist()} == ends
+    levels = [line[0][1] for line in lines(axes) if [x for x, _ in line] == [0.0, 1.0]]
+    assert levels == [100.0 * data.facts.optimum, 100.0 * data.facts.chance_level]
     looks = {(line.get_color(), line.get_marker()) for line in axes.get_lines()}
     assert {(style["color"], style["marker"]) for style in map(figures.line_style, WIDE.agents)} <= looks
     thesis = [(budget, 100.0 * mean) for budget, (mean, _) in data.thesis["dqn"].items()]
     assert any(np.allclose(each, thesis) for each in lines(axes) if len(each) == len(thesis))
+    bars = [[(x, 100.0 * (mean + std)) for std in (-std, std)] for x, (mean, std) in data.thesis["dqn"].items()]
+    assert any(np.allclose(each.get_segments(), bars) for each in axes.collections if isinstance(each, LineCollection))
     short = bench_result(data.result.folder, protocol=dataclasses.replace(WIDE, budgets=(10, 20)))
     assert success_figure(collect(short)).axes[0].get_xlim()[1] < 25, "far points of the thesis do not stretch it"
 
@@ -51,6 +60,8 @@ def test_the_success_figure_draws_scores_bands_and_the_thesis(data: ReportData) 
 def test_the_open_loop_figure_draws_the_means_of_the_file_by_depth(data: ReportData) -> None:
     """The first macro-action that is imagined has depth 1."""
     loops = open_loop_means(data.result)
+    assert loops["imagination"]["count"].tolist() == [100 * len(WIDE.seeds)] * DEPTH
+    assert np.isnan(loops["imagination"]["auroc_modal"][0]), "unknown in every run"
     panels = {axes.get_title(): lines(axes) for axes in open_loop_figure(loops).axes}
     rows = [row for row in csv.DictReader(io.StringIO(open_loop_csv(data.result))) if row["episodes"] == "6000"]
     depths = range(1, DEPTH + 1)

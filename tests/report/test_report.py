@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
 import math
 import re
 from pathlib import Path
@@ -18,10 +16,11 @@ from whole_outputs import Expected
 from imagine_bench import statistics
 from imagine_bench.errors import ArtefactError
 from imagine_bench.protocols.control import Protocol
+from imagine_bench.registry.entries import FIRST, TODAY
 from imagine_bench.report import bench_page, write_report
 from imagine_bench.report.bench import shown, verdict
-from imagine_bench.report.data import DIFFERENCE, SCORE, collect
-from imagine_bench.report.page import Page, Table, number, percent
+from imagine_bench.report.data import collect
+from imagine_bench.report.page import Page, Table, number
 from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
 
 
@@ -59,29 +58,6 @@ def table(page: Page, name: str) -> Table:
     """A table of a page."""
     (found,) = (each for section in page.sections for each in section.tables if each.name == name)
     return found
-
-
-def score_of_dqn(page: Page) -> str:
-    (row,) = (row for row in table(page, "scores").rows if row[0] == "dqn")
-    return row[1]
-
-
-def test_the_mean_stands_beside_a_mean_that_leaves_seeds_out(many: BenchResult, result: BenchResult) -> None:
-    shares = many.success_rates("dqn")[:, 0]
-    page = bench_page(many)
-    assert score_of_dqn(page).startswith(f"{percent(statistics.iqm(shares))} / {percent(shares.mean())} [")
-    assert "(2 of 7 seeds left out) / mean of all" in page.subtitle
-    shares = result.success_rates("dqn")[:, 0]
-    page = bench_page(result)
-    assert score_of_dqn(page) == f"{percent(shares.mean())} ({percent(shares.min())} to {percent(shares.max())})"
-    assert "too few for an interval" in page.subtitle
-
-
-def test_each_part_of_a_wide_table_on_a_terminal_names_its_rows() -> None:
-    wide = Table("wide", ["agent", *(f"a long name of a column {place}" for place in range(5))], [["dqn", *"12345"]])
-    parts = wide.text.split("\n\n")
-    assert len(parts) > 1
-    assert {tuple(line.split()[0] for line in part.splitlines()[::2]) for part in parts} == {("agent", "dqn")}
 
 
 # The verdict -------------------------------------------------------------------------------------------------------
@@ -145,14 +121,6 @@ def test_verdicts(many: BenchResult, result: BenchResult, headed: BenchResult, e
     assert first == other, "seeds are typed in two ways"
 
 
-def test_three_seeds_are_too_few_to_say_whatever_they_solve(result: BenchResult) -> None:
-    page = bench_page(shifted(result, dqn=[100, 102, 104], imagination=[198, 199, 200]))
-    assert table(page, "gains").caption.startswith("Too few seeds to say")
-    rows = list(csv.DictReader(io.StringIO(page.files["summary.csv"])))
-    assert {row["interval_over"] for row in rows} == {"too few seeds"}
-    assert all(row[name] in ("", "nan") for row in rows for name in (*SCORE[1:], *DIFFERENCE[1:], "p_holm"))
-
-
 def test_one_seed_hides_no_difference_of_others(many: BenchResult) -> None:
     first = collect(many).compared[0]
     protocol = dataclasses.replace(many.protocol, few_seeds=((first, many.protocol.seeds[0]),))
@@ -188,6 +156,12 @@ def test_a_difference_is_shown_only_after_holms_correction(many: BenchResult) ->
         ({"queries": 2}, "up to 2 oracle queries an episode"),
         ({"feedback": 5.0, "feedback_error": 0.2}, "a teacher's feedback of 5, wrong in 20.0 %"),
         ({"after": ("arrow_puzzle_hard",)}, "trained before on arrow_puzzle_hard, 100 episodes each"),
+        (
+            {"after": ("arrow_puzzle_hard",), "unannounced": True},
+            "trained before on arrow_puzzle_hard, 100 episodes each, without notice of a change",
+        ),
+        ({"dataset": "mixed-6@0123456789ab"}, "trained first on dataset mixed-6@0123456789ab"),
+        ({"split": "plan_length=2"}, "tests start where training never does, plan_length=2"),
         ({"physics": (("pad_friction", 0.5),)}, "physics execution, pad_friction=0.5"),
     ],
 )
@@ -197,6 +171,17 @@ def test_the_page_says_what_helps_learners_and_what_changes_the_world(
     protocol = dataclasses.replace(result.protocol, **changes)
     assert f" · {words} · " in bench_page(dataclasses.replace(result, protocol=protocol)).subtitle
     assert words not in bench_page(result).subtitle
+
+
+@pytest.mark.parametrize(("edition", "then"), [(TODAY, "The same bench command goes on."), (FIRST, "Its agents had")])
+def test_an_unfinished_bench_names_four_of_its_runs_and_how_it_goes_on(
+    result: BenchResult, edition: int, then: str
+) -> None:
+    runs = ("a seed 0", "b seed 1", "c seed 2", "d seed 3", "e seed 4")
+    whole = dataclasses.replace(result.protocol, agent_names=edition)
+    for count, named in ((4, "; ".join(runs[:4])), (5, f"{'; '.join(runs[:4])}; …")):
+        first, *_ = verdict(collect(dataclasses.replace(result, missing=runs[:count], whole=whole)))
+        assert f" Missing are {named}. {then}" in first
 
 
 def test_agents_that_do_not_learn_are_not_compared(tmp_path: Path) -> None:

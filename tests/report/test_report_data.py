@@ -13,19 +13,16 @@ import pytest
 from fake_results import WIDE, bench_result, rewritten
 from guest_packages import Guests
 
-from imagine_bench import reference, registry, statistics
+from imagine_bench import registry, statistics
 from imagine_bench.errors import SetupError, UnknownNameError
 from imagine_bench.protocols.control import Protocol
-from imagine_bench.report.bench import bench_page, cost
+from imagine_bench.report.bench import bench_page, cost, gain
 from imagine_bench.report.data import (
-    DIFFERENCE,
-    SCORE,
     card_of,
     collect,
     frames_before,
     known_agent,
     known_task,
-    open_loop_means,
 )
 from imagine_bench.report.page import count, seconds
 from imagine_bench.rules import fewest_actions
@@ -75,39 +72,16 @@ def test_costs_are_means_over_seeds(result: BenchResult, agent: str) -> None:
     assert shown == [*counts, seconds(records[-1]["train_cpu_s"]), faults]
 
 
-def test_open_loop_quality_is_the_mean_at_the_last_budget(result: BenchResult) -> None:
-    found = open_loop_means(result)
-    assert set(found) == {agent for agent in result.protocol.agents if agent.startswith("imagination")}
-    last = [run.checkpoints[-1].open_loop for run in result.of("imagination")]
-    assert found["imagination"]["count"].tolist() == [100 * statistics.FEWEST] * 10
-    for name in ("correct", "reward_mae", "auroc_epistemic"):
-        assert found["imagination"][name] == pytest.approx(np.mean([getattr(loop, name) for loop in last], 0))
-    assert np.isnan(found["imagination"]["auroc_modal"][0]), "unknown in every run"
-
-
-def test_gains_are_of_learners_over_dqn(result: BenchResult) -> None:
-    data = collect(result)
-    trials = result.protocol.evaluation_episodes
-    learners = {agent for agent in result.protocol.agents if registry.agent_entry(agent).learns}
-    assert {record["agent"] for record in data.records if "gain" in record} == learners - {"dqn"}
-    assert {record["agent"] for record in data.records if "area" in record} == learners
-    shares, base = (result.success_rates(agent)[:, 1] for agent in ("imagination", "dqn"))
-    row = data.of("imagination")[1]
-    assert tuple(row[name] for name in DIFFERENCE) == statistics.difference(shares, base, trials=trials)
-    assert row["gain"] == pytest.approx((shares.mean() - base.mean()) / base.mean())
-    assert row["thesis_gain"] == reference.gain("arrow_puzzle", "imagination")[2000]
-    dqn = data.of("dqn")[1]
-    assert (dqn["thesis_mean"], dqn["thesis_std"]) == reference.success("arrow_puzzle", "dqn")[2000]
-    assert tuple(dqn[name] for name in SCORE) == (statistics.iqm(base), *statistics.interval(base, trials=trials))
-
-
 def test_frames_seen_beforehand_are_those_of_the_card(result: BenchResult) -> None:
     path, agents = encoders.bundled()["arrow_puzzle-clean"], ("random", "imagination")
     seen = json.loads(path.with_suffix(".json").read_text())["recipe"]["frames"]
-    for identity, frames in ((encoders.identity(path), seen), ("foreign@0123456789ab", math.nan)):
+    offered = {"of_theirs@0123456789ab": {"recipe": {"frames": 7}, "offer": "theirs:Encoder"}}  # trained elsewhere
+    unknown = [*offered, "foreign@0123456789ab"]
+    for identity, frames in ((encoders.identity(path), seen), *((each, math.nan) for each in unknown)):
         protocol = dataclasses.replace(result.protocol, agents=agents, encoder=identity)
         runs = tuple(run for run in result.runs if run.agent in agents)
-        data = collect(dataclasses.replace(result, protocol=protocol, runs=runs))
+        facts = {**result.environment, "encoders": offered}
+        data = collect(dataclasses.replace(result, protocol=protocol, runs=runs, environment=facts))
         assert [frames_before(data, agent) for agent in agents] == [0, pytest.approx(frames, nan_ok=True)]
 
 
@@ -164,6 +138,10 @@ def test_the_same_starts_are_compared(tmp_path: Path) -> None:
         assert record["probability_of_improvement"] == statistics.probability_of_improvement(*rates)
     corrected = statistics.holm([record["p_mcnemar"] for record in compared])
     assert [record["p_mcnemar_holm"] for record in compared] == corrected.tolist()
+    (_, shown) = gain(data).tables  # type: ignore[union-attr]
+    for row, record, p in zip(shown.rows, compared, corrected, strict=True):
+        alone = [count(record[name]) for name in ("episodes", "alone", "dqn_alone")]
+        assert row == [record["agent"], *alone, f"{p:.3f}"]
     rules = protocol.spec(testing=True).rules
     fewest = {start: fewest_actions(rules, start) for start in rules.start_states}
     for record in data.records:

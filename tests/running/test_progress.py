@@ -9,7 +9,7 @@ from bench_fakes import FakeRunSpec
 from small_runs import small
 
 from imagine_bench.protocols.data import Phase, Progress
-from imagine_bench.running.bench import ProgressBar
+from imagine_bench.running.bench import ProgressBar, counted
 
 WORK = 9 + 2 * 5
 """Of a learner: training episodes, and tests at two budgets."""
@@ -30,16 +30,26 @@ def now_s(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return clock
 
 
-def test_time_left_counts_no_earlier_or_failed_work(now_s: list[float], capsys: pytest.CaptureFixture[str]) -> None:
-    """Of 72 parts, 9 were done before and 10 take ten hours; 34 are left, for a run that failed has 19."""
+@pytest.mark.parametrize(
+    ("gone_s", "times"),
+    [
+        (36_000.0, "10:00:00 elapsed, about 34 h left"),
+        (1_500.0, "25:00 elapsed, about 85 min left"),
+        (20.0, "00:20 elapsed, about 68 s left"),
+    ],
+)
+def test_time_left_counts_no_earlier_or_failed_work(
+    gone_s: float, times: str, now_s: list[float], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of 72 parts, 9 were done before and 10 take this time; 34 are left, for a run that failed has 19."""
     with ProgressBar(SPECS) as show:
         show(far(0, 9))
         show(far(1, 0, "failed", detail="RuntimeError: it broke"))
-        now_s[0] = 36_000.0
+        now_s[0] = gone_s
         show(far(0, WORK, "done"))
     said, line = capsys.readouterr().err.splitlines()
     assert said == "table seed 1 failed: RuntimeError: it broke"
-    assert line.startswith("1/6 runs · 10:00:00 elapsed, about 34 h left")
+    assert line.startswith(f"1/6 runs · {times}")
 
 
 def test_a_minute_shows_each_run_and_its_curve(now_s: list[float], capsys: pytest.CaptureFixture[str]) -> None:
@@ -65,3 +75,12 @@ def test_a_share_that_is_solved_is_of_tests_alone(
         now_s[0] = 20.0
         show(far(0, 4, phase, episode=6, success=0.4))
     assert capsys.readouterr().err.splitlines()[-1].endswith(words)
+
+
+def test_time_left_of_things_is_that_of_those_done(now_s: list[float], capsys: pytest.CaptureFixture[str]) -> None:
+    for number in counted(range(4), "things", total=4):
+        now_s[0] += 10.0 + 10.0 * number
+    said = capsys.readouterr().err.splitlines()
+    assert said == ["things: 2 of 4, 00:30 gone, 00:30 left", *(f"things: {line}" for line in (
+        "3 of 4, 01:00 gone, 00:20 left", "4 of 4, 01:40 gone, 00:00 left",
+    ))]  # fmt: skip

@@ -28,22 +28,13 @@ from imagine_bench.errors import DivergedError
 from imagine_bench.exact.splits import split_of
 from imagine_bench.interfaces import Observation, Transition
 from imagine_bench.interfaces.episodes import Episodes
-from imagine_bench.protocols.data import RunSpec
+from imagine_bench.protocols.data import Progress, RunSpec
 from imagine_bench.recording import episodes
 from imagine_bench.registry import AgentEntry
-from imagine_bench.running.evaluation import EpisodeRecord, EvaluationCounts, start_from
+from imagine_bench.running.evaluation import start_from
 from imagine_bench.running.run_state import Counters, make_env
 from imagine_bench.seeding import TUNING_SEEDS, episode_seed
 from imagine_bench.store.run_folder import load_newest
-
-
-def test_figures_of_a_test_by_hand() -> None:
-    counts = EvaluationCounts()
-    for actions, total, faults, success in (([0, 1, 2], 7.0, 2, True), ([1], -1.0, 0, False)):
-        counts.add(EpisodeRecord([0], [0], 0, actions=actions, total=total, faults=faults, success=success))
-    assert counts.figures() == {
-        "test_episodes": 2, "successes": 1, "solved": "10", "mean_return": 3.0, "mean_length": 2.0, "faults": 2,
-    }  # fmt: skip
 
 
 def test_a_repeated_action_keeps_the_episode_of_its_first_time() -> None:
@@ -119,6 +110,17 @@ def test_a_run_counts_what_happens(tmp_path: Path) -> None:
     assert [row.diagnostics["real_transitions"] for row in result.checkpoints] == steps
     assert all(row.test_episodes == 5 and 1 <= row.mean_length <= 10 for row in result.checkpoints)
     assert (result.agent, result.seed, result.settings) == ("table", 3, {"rate": 0.5})
+
+
+@pytest.mark.parametrize("agent", ["table", "random"])
+def test_a_run_is_through_with_its_work_at_its_end(tmp_path: Path, agent: str) -> None:
+    """Episodes on tasks before count; the one test of an agent that does not learn stands at both budgets."""
+    after = {"after": ("arrow_puzzle_hard",), "after_episodes": 3, "unannounced": True}
+    spec = RunSpec(protocol=small(agents=("table", "random"), evaluation_episodes=2, **after), agent=agent, seed=0)
+    heard: list[Progress] = []
+    run_observed(spec, tmp_path, heard.append)
+    assert heard[-1].phase == "done" and heard[-1].done == heard[-1].work
+    assert [each.done for each in heard] == sorted(each.done for each in heard)
 
 
 def test_only_the_privileged_are_shown_more_than_frames(tmp_path: Path) -> None:

@@ -42,6 +42,11 @@ def test_a_real_agent_is_taken_up_as_its_run_left_it(tmp_path: Path) -> None:
     left = final_arrays(folder)
     taken_up = who.agent.state().arrays
     assert set(taken_up) == set(left) and all(np.array_equal(array, taken_up[name]) for name, array in left.items())
+    config = run_folder.read_config(folder)
+    as_presets_change = {**config, "protocol": dataclasses.replace(wanted, overrides=()).as_dict()}
+    write_json(folder / "config.json", sealed(as_presets_change))
+    assert load_trained(folder).agent.settings == who.agent.settings, "it has those that it ran with"  # type: ignore[attr-defined]
+    write_json(folder / "config.json", sealed(config))
     first, again = (next(make_plans(load_trained(folder), count=1, execution="kinematic")) for _ in range(2))
     assert np.array_equal(first.compared.rollout.q_values, again.compared.rollout.q_values)
     with pytest.raises(ArtefactError, match=r"There is no .*config\.json, a run's configuration; give a run's folder"):

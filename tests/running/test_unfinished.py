@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 from pathlib import Path
 
 import pytest
 from small_runs import Inline, small
 
+from imagine_bench import registry
 from imagine_bench.errors import ArtefactError
 from imagine_bench.report import summary_table, write_report
 from imagine_bench.running import bench as benches
@@ -63,3 +65,12 @@ def test_a_bench_lacks_its_unfinished_runs_alone(tmp_path: Path) -> None:
     part = load_so_far(folder)
     assert part.protocol == result.protocol == part.whole
     assert part.missing == ("table seed 0: its recording",)
+
+
+@pytest.mark.usefixtures("own_names")
+def test_the_costliest_run_of_a_seed_begins_first(tmp_path: Path) -> None:
+    registry.AGENTS["table"] = dataclasses.replace(registry.AGENTS["table"], relative_cost=2.0)
+    launcher = Inline(patience=2)
+    with pytest.raises(KeyboardInterrupt):
+        bench(tmp_path, launcher)
+    assert launcher.order == [("table", 0), ("imaginer", 0)]

@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from imagine_bench.store.files import (
     make_plain,
     read_sealed,
     sealed,
+    sweep,
     table_rows,
     table_text,
     write_json,
@@ -99,6 +101,14 @@ def test_a_sealed_file_without_its_seal_or_value_is_refused(tmp_path: Path) -> N
 )
 def test_what_either_side_lacks_is_a_difference(then: Json, now: Json, found: tuple[str, Json, Json] | None) -> None:
     assert first_difference(then, now) == found
+
+
+def test_what_another_may_still_write_is_not_swept(tmp_path: Path) -> None:
+    for name, age_s in ((".new.1.partial", 3_000), (".old.2.partial", 4_000)):
+        (tmp_path / name).touch()
+        os.utime(tmp_path / name, (time.time() - age_s,) * 2)
+    sweep(tmp_path, older_than_s=3_600.0)
+    assert [path.name for path in tmp_path.iterdir()] == [".new.1.partial"]
 
 
 def test_a_table_has_the_columns_of_all_its_rows() -> None:

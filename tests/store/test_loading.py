@@ -20,6 +20,7 @@ from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.report import summary_table, write_report
 from imagine_bench.running.bench import bench, load_bench
+from imagine_bench.running.evaluation import EvaluationCounts
 from imagine_bench.store.loading import archive_files, cut, load_so_far, merge
 from imagine_bench.store.results import BenchResult, KeptEpisodes
 
@@ -256,11 +257,13 @@ def test_a_table_cut_short_leaves_later_imagination_out(tmp_path: Path) -> None:
     result = bench_result(tmp_path)
     run = next(run for run in result.runs if run.agent == "imagination")
     assert run.imagined, "there is something to leave out"
+    shown: dict[str, Any] = dict.fromkeys(("recorded", "sampled_rollouts"), run.imagined)
+    run = dataclasses.replace(run, **shown)
     whole, budgets = result.protocol, result.protocol.budgets
-    assert cut(run, whole).imagined == run.imagined
+    assert all(getattr(cut(run, whole), name) == run.imagined for name in ("imagined", *shown))
     short = cut(run, dataclasses.replace(whole, budgets=budgets[:-1]))
     assert [row.episodes for row in short.checkpoints] == list(budgets[:-1])
-    assert short.imagined == () and short.sampled_rollouts == ()
+    assert short.imagined == short.sampled_rollouts == short.recorded == ()
     assert len(short.training_success) == len(short.training_length) == budgets[-2]
 
 
@@ -278,7 +281,7 @@ def test_a_row_of_the_first_tests_counts_these_alone(tmp_path: Path) -> None:
     totals: dict[str, Any] = {"test_episodes": 4, "successes": 3, "solved": "1011", "faults": 3}
     means = {"mean_return": 35.5, "mean_length": 1.75}
     row = dataclasses.replace(bench_result(tmp_path).runs[0].checkpoints[0], kept=kept, **totals, **means)
-    assert row.of_first(4) == row
+    assert row.of_first(4) == row and EvaluationCounts.of(kept).figures() == {**totals, **means}
     first = row.of_first(2)
     assert (first.test_episodes, first.successes, first.solved, first.faults) == (2, 1, "10", 2)
     assert (first.success_rate, first.mean_return, first.mean_length) == (0.5, 21.5, 2.0)

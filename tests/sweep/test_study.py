@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import itertools
 import json
 import math
 import tomllib
@@ -22,7 +23,7 @@ from small_runs import Inline
 from whole_outputs import Expected
 
 import imagine_bench
-from imagine_bench import registry
+from imagine_bench import registry, statistics
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.exact.values import true_model
@@ -108,12 +109,13 @@ def test_a_study_that_was_written_is_loaded(tmp_path: Path) -> None:
 def test_a_difference_is_that_from_what_a_variant_is_compared_with(tmp_path: Path) -> None:
     optimal = Variant(name="optimal", factor="agent", agent="oracle", against="table")
     second = Variant(name="imaginer", factor="agent", agent="imaginer", against="optimal")
-    study = dataclasses.replace(STUDY, variants=(STUDY.variants[0], optimal, second))
+    five = (1000, 1001, 1002, 1003, 1004)
+    study = dataclasses.replace(STUDY, seeds=five, variants=(STUDY.variants[0], optimal, second))
     lines = run_study(study, "arrow_puzzle", root=tmp_path, launcher=Inline())
-    means = [line.success.mean(axis=0) for line in lines]
-    assert lines[0].difference is None and (means[1] == 1.0).all() and means[0].min() < 1.0
-    for line, gains in zip(lines[1:], np.diff(means, axis=0), strict=True):
-        assert [one.value for one in line.difference or ()] == pytest.approx(gains.tolist())
+    assert lines[0].difference is None and (lines[1].success == 1.0).all() and lines[0].success.min() < 1.0
+    for base, line in itertools.pairwise(lines):
+        both = zip(line.success.T, base.success.T, strict=True)
+        assert line.difference == tuple(statistics.difference(*each, trials=study.evaluation_episodes) for each in both)
 
 
 @pytest.mark.parametrize(

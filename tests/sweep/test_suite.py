@@ -63,15 +63,6 @@ def _without_times(text):
     ]
 
 
-def test_the_oracle_scores_one_and_who_says_nothing_of_its_model_zero(result):
-    by_name = {each.name: each for each in TINY.experiments}
-    for name in ("size", "transfer"):  # nothing is random there
-        assert result.score(by_name[name], "oracle").value == 1.0
-    assert result.score(by_name["stochasticity"], "oracle").value == pytest.approx(1.0, abs=0.15)
-    assert result.score(by_name["stochasticity"], "random").value == pytest.approx(0.0, abs=0.3)
-    assert result.score(by_name["uncertainty"], "table").value == 0.0
-
-
 @pytest.mark.parametrize(("measure", "is_of_tests"), [("success", True), ("auroc", False)])
 def test_the_number_of_tests_widens_intervals_of_success_alone(measure, is_of_tests):
     """An AUROC is no share of the tests: its interval is that over seeds, and one seed has none."""

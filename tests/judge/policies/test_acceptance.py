@@ -66,25 +66,6 @@ def test_wrong_exchangeable_transitions_are_seldom_accepted(*, levels: int, usef
         assert failures / rounds >= promised - noise, "without ties it is not stricter than it need be"
 
 
-def test_occupancies_are_those_of_episodes_that_are_played() -> None:
-    world = world_of("arrows:cubes=2,slip=0.2")
-    found = occupancies(world, world.policies.tables[:1])[0]
-    rng = np.random.default_rng(0)
-    counts = np.zeros_like(found)
-    for _ in range(400):
-        state = int(rng.choice(len(world.starts), p=world.starts))
-        for _ in range(world.horizon):
-            action = int(rng.integers(counts.shape[1]))
-            counts[state, action] += 1
-            after = world.dense_truth.onward[state, action]
-            state = int(rng.choice(len(after) + 1, p=np.append(after, max(0.0, 1.0 - after.sum()))))
-            if state == len(after):
-                break
-    counts /= counts.sum()
-    assert found.sum() == pytest.approx(1.0)
-    assert 0.5 * np.abs(counts.sum(axis=1) - found.sum(axis=1)).sum() < 0.12
-
-
 def planted(world: PolicyWorld, wrong_states: Floats, knows: float) -> dict[str, float]:
     """The scores of a model that is wrong in some macrostates; ``knows`` 1 says just that."""
     frames = 2

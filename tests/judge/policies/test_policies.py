@@ -172,21 +172,6 @@ def test_exploits_lie_between_those_of_every_plan_and_the_bound(states: int, act
             assert values == pytest.approx(again)
 
 
-def test_no_policy_passes_the_search_and_no_search_passes_the_bound() -> None:
-    rng = np.random.default_rng(0)
-    for states, actions, horizon in ((5, 3, 4), (12, 4, 10), (30, 2, 6)):
-        truth, other = (random_model(rng, states, actions) for _ in range(2))
-        starts = np.full(states, 1.0 / states)
-        policies = rng.dirichlet(np.ones(actions), size=(10, states))
-        for share in (0.01, 0.3, 1.0):  # from nearly right to wrong
-            model = DenseModel(*((1.0 - share) * a + share * b for a, b in zip(truth, other, strict=True)))
-            gaps = (values_of(model, policies, horizon) - values_of(truth, policies, horizon)) @ starts
-            found = largest_exploit(model, truth, starts, policies, horizon, rng)
-            lower = starts @ (found.believed - found.real)
-            assert gaps.max() <= lower + 1e-9 <= starts @ upper_bound(model, truth, horizon) + 2e-9
-        assert upper_bound(truth, truth, horizon) == pytest.approx(0.0, abs=1e-12)
-
-
 @pytest.mark.parametrize(("reached", "over", "steps"), [((1,), False, 3), ((1,), True, 1), ((7,), False, 1)])
 def test_a_course_ends_with_the_episode_the_plan_or_the_known_world(reached: State, over: bool, steps: int) -> None:
     plan = np.zeros((3, 2), dtype=np.int64)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
+import json
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,15 +14,16 @@ import numpy as np
 import pytest
 from small_runs import Inline, do, small
 
-from imagine_bench import registry
+from imagine_bench import registry, statistics
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import State
 from imagine_bench.judge import judgement, questions
-from imagine_bench.judge.judgement import Judgement, judge, kept, shown
+from imagine_bench.judge.judgement import Judgement, data_of, judge, kept, shown
 from imagine_bench.judge.models import ModelSource, model_entry, opened, source_of
 from imagine_bench.judge.reading import RenderedFrameIndex
 from imagine_bench.protocols.control import protocol
-from imagine_bench.report.judge import Judged, judged, judgement_page
+from imagine_bench.report.judge import Judged, compared, judged, judgement_page
+from imagine_bench.report.page import estimate, number
 from imagine_bench.running import bench as benches
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders, run_folder
@@ -88,6 +91,23 @@ def test_a_verdict_says_what_each_model_had_learned_from(runs: dict[str, Path], 
     }
     fitted = " after 40 transitions"
     assert list(said.values()) == [fitted, "", f"{fitted} (of trained agents, after their benches)"]
+
+
+@pytest.mark.parametrize(("apart", "better"), [(0.035, "no difference is shown"), (0.1, "it is better")])
+def test_the_two_best_models_that_learned_are_compared(tmp_path: Path, apart: float, better: str) -> None:
+    """Seven seeds of each; of six pairs that are compared, one is of these two."""
+    least = {"structured": 0.504 + apart, "exact": 0.0, "copy": 0.5 + apart, "gaussian": 0.5}
+    held = {model: [score + 0.01 * seed for seed in range(7)] for model, score in least.items()}
+    one = Judgement(task="pick_place", models=tuple(held), sizes=(40,))
+    cells = {(model, 40): [{"unbiased": score} for score in scores] for model, scores in held.items()}
+    section = compared(Judged(tmp_path, one, registry.task(one.task), cells))
+    pairs = [statistics.difference(held[one], held[other]) for one, other in itertools.combinations(held, 2)]
+    corrected = statistics.holm([each.p for each in pairs])
+    shown = [[estimate(each, number), number(p)] for each, p in zip(pairs, corrected, strict=True)]
+    assert [row[2:] for row in section.tables[0].rows] == shown and pairs[5].p < 0.05
+    (said,) = section.answers
+    assert f"{model_entry('gaussian').label} (0.530), then copy the last frame ({0.53 + apart:.3f}); " in said
+    assert said.endswith(f"difference {shown[5][0]}, p = {shown[5][1]}, Holm-corrected: {better}.")
 
 
 @pytest.mark.usefixtures("_few")
@@ -174,6 +194,16 @@ def test_nonsense_is_refused(runs: dict[str, Path]) -> None:
             Judgement(**{"task": "pick_place", "models": ("copy",), **given})
 
 
+def test_models_learn_from_what_the_policy_collected(tmp_path: Path) -> None:
+    """As many episodes as the transitions need, in the judgement's looks."""
+    one = Judgement(task="arrow_puzzle", models=("copy",), sizes=(5, 12), policy="mixed", appearance="mild")
+    data = data_of(one, tmp_path, 3)
+    assert data.card is not None and len(data.episodes.actions) >= 12
+    assert [data.card[name] for name in ("policy", "appearance", "execution", "seed")] == [
+        *("mixed", "mild", "kinematic"), 3,
+    ]  # fmt: skip
+
+
 def test_judgements_that_cannot_be_compared_lie_apart() -> None:
     def folder(**changes: Any) -> str:
         return Judgement(**{"task": "pick_place", "models": ("gaussian",), **changes}).folder_name
@@ -201,6 +231,7 @@ def test_a_judgement_is_of_the_world_that_a_file_describes_now(tmp_path: Path) -
 def test_models_take_the_given_encoder_if_it_is_of_their_kind() -> None:
     costs = [_source(name, "pick_place", encoder=_LATENTS).cost for name in ("gaussian", "structured")]
     assert [cost["encoder"] for cost in costs] == [_LATENTS, "pick_place-clean-codes"]
-    assert "encoder_reads" not in costs[0]
+    card = json.loads(encoders.bundled()[_LATENTS].with_suffix(".json").read_text())
+    assert costs[0]["encoder_frames"] == card["recipe"]["frames"] and "encoder_reads" not in costs[0]
     few = _source("structured", "arrow_puzzle", "strong").cost["encoder_reads"]
     assert few == pytest.approx(0.115, abs=1e-3)
