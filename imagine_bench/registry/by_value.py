@@ -33,6 +33,7 @@ _NO_CODE = frozenset(
     )
 )
 """Attributes of a class that Python itself adds, or that change nothing that it does."""
+_CACHED = type(functools.cache(len))
 _ATTRIBUTES: Mapping[type, tuple[str, ...]] = {
     CodeType: ("co_code", "co_consts", "co_names", "co_varnames", "co_freevars"),
     MethodType: ("__func__", "__self__"),
@@ -42,7 +43,7 @@ _ATTRIBUTES: Mapping[type, tuple[str, ...]] = {
     functools.partial: ("func", "args", "keywords"),
     property: ("fget", "fset", "fdel"),
     staticmethod: ("__func__",),
-    type(functools.cache(len)): ("__wrapped__",),
+    _CACHED: ("__wrapped__",),
 }
 """The attributes that decide about an object of one of Python's own types."""
 
@@ -119,11 +120,26 @@ def _unfindable_by_value() -> Iterator[None]:
     ]
     for module in modules:
         cloudpickle.register_pickle_by_value(module)
+    copyreg.pickle(_CACHED, _cached_by_value)
     try:
         yield
     finally:
+        copyreg.dispatch_table.pop(_CACHED, None)
         for module in modules:
             cloudpickle.unregister_pickle_by_value(module)
+
+
+def _cached_by_value(function: Any) -> str | tuple[Any, ...]:
+    """A function with a cache as pickles have it: by its name, or where a new process would not find that, as its code
+    and an empty cache.
+    """
+    if function.__module__ not in {"__main__", *cloudpickle.list_registry_pickle_by_value()}:
+        return str(function.__qualname__)
+    return _with_cache, (function.__wrapped__, function.cache_parameters())
+
+
+def _with_cache(function: Callable[..., Any], parameters: Mapping[str, Any]) -> Callable[..., Any]:
+    return functools.lru_cache(**parameters)(function)
 
 
 def _described(value: object, seen: dict[int, tuple[int, object]]) -> Iterator[str]:
