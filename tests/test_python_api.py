@@ -239,6 +239,19 @@ def results(tmp_path: Path) -> api.Comparison:
     return imagine_bench.bench("arrow_puzzle", agents=["random", Shifting], out=tmp_path, **TWO_EPISODES)
 
 
+def test_a_class_of_an_equal_name_elsewhere_is_not_the_registered_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = ModuleType("first"), ModuleType("second")
+    for module, action in ((first, 1), (second, 2)):
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+        exec(_SOURCE.replace("return self.wrapped(int(observation.frame.sum()))", f"return {action}"), vars(module))
+    imagine_bench.register_agent("named", first.MyAgent, title="Named")
+    ran = [imagine_bench.bench("arrow_puzzle", agents=[each.MyAgent], out=tmp_path, **TWO_EPISODES)
+           for each in (first, second)]  # fmt: skip
+    assert [set(each.frame()["agent"]) for each in ran] == [{"named"}, {"MyAgent"}]
+
+
 def test_a_changed_class_resumes_no_run(results: api.Comparison, capsys: pytest.CaptureFixture[str]) -> None:
     run = results.folder / "Shifting/seed_0"
     content = {path: path.read_bytes() for path in results.folder.rglob("*") if path.is_file()}

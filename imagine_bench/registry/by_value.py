@@ -56,6 +56,7 @@ class CodeByValue:
     pickled: bytes = field(compare=False)  #: the bytes of :mod:`cloudpickle`, each time others
     digest: str  #: twelve hex digits, see :func:`code_digest`
     module: str = field(default="", compare=False)  #: its module where that is of an installed package
+    home: str = field(default="", compare=False)  #: its module, whichever that is
 
     @classmethod
     def of(cls, target: Callable[..., Any]) -> CodeByValue:
@@ -77,7 +78,7 @@ class CodeByValue:
                 "itself, in its constructor, and keep them out of variables around it."
             ) from error
         module = str(getattr(target, "__module__", ""))
-        return cls(name, pickled, code_digest(target), module if _is_of_package(module) else "")
+        return cls(name, pickled, code_digest(target), module if _is_of_package(module) else "", module)
 
     def __str__(self) -> str:
         return f"the code of {self.name}"
