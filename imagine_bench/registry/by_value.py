@@ -11,6 +11,7 @@ import copyreg
 import dis
 import functools
 import hashlib
+import random
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -46,6 +47,7 @@ _ATTRIBUTES: Mapping[type, tuple[str, ...]] = {
     _CACHED: ("__wrapped__",),
 }
 """The attributes that decide about an object of one of Python's own types."""
+_GENERATORS = (np.random.Generator, np.random.BitGenerator, np.random.RandomState, random.Random)
 
 
 @dataclass(frozen=True, repr=False)
@@ -189,7 +191,12 @@ def _parts(value: object) -> Iterator[object]:
 
 
 def _pickled_parts(value: Any) -> Iterator[object]:
-    """The parts that a pickle keeps of an object of any other type; of one that has none, such as a lock, nothing."""
+    """The parts that a pickle keeps of an object of any other type; of one that has none, such as a lock, nothing.
+
+    Nothing of a random generator, whose state changes as it draws; numpy's, Python's or torch's.
+    """
+    if isinstance(value, _GENERATORS) or hasattr(value, "initial_seed"):
+        return
     reduced = copyreg.dispatch_table.get(type(value), lambda it: it.__reduce_ex__(4))
     try:
         if isinstance(value, np.ndarray) or hasattr(value, "requires_grad"):  # of objects, or torch's: with addresses
