@@ -354,16 +354,17 @@ def register_agent(name: str, make: MakeAgent | str, **options: Any) -> None:
 def _name(agent: str | MakeAgent) -> str:
     """The name of an agent; a class or function that is not registered yet is registered by its own.
 
-    One that was registered and has been changed since keeps its name and its other fields.
+    One that was registered, once, and has been changed since keeps its name and its other fields.
     """
     if isinstance(agent, str):
         return agent
     code = CodeByValue.of(agent)
-    entries = {name: entry for name, entry in registry.AGENTS.items() if isinstance(entry.make, CodeByValue)}
-    same = [name for name, entry in entries.items() if entry.make == code]
-    former = [name for name, entry in entries.items() if str(entry.make) == str(code)]
-    for name in [*same, *former]:
-        registry.AGENTS[name] = dataclasses.replace(entries[name], make=code)
+    made_by = {name: entry.make for name, entry in registry.AGENTS.items() if isinstance(entry.make, CodeByValue)}
+    same = [name for name, make in made_by.items() if make == code]
+    place = (code.home, code.name)
+    former = [name for name, make in made_by.items() if (make.home, make.name) == place]
+    for name in same or (former if len(former) == 1 else ()):
+        registry.AGENTS[name] = dataclasses.replace(registry.AGENTS[name], make=code)
         return name
     name = code.name.rpartition(".")[2]
     register_agent(name, agent)

@@ -43,11 +43,15 @@ _LOCK = threading.Lock()
 _TIMES = ("train_cpu_s", "eval_cpu_s")
 _SOURCE = """
 import functools
+import numpy as np
+from pathlib import Path
 from imagine_bench.agents.baselines import RandomAgent
 
 FIRST = 1
 TABLE = {"left": [0, 2], "right": (1, 3)}
+OTHERS = (range(3), Path("weights"), np.float32(0.5), np.array([None, "a"]))
 
+@functools.cache
 def shifted(number, by=FIRST, *, twice=0):
     return number + by + 2 * twice
 
@@ -62,7 +66,11 @@ class MyAgent(Base):
 
     @property
     def table(self):
-        return TABLE
+        return TABLE, OTHERS
+
+    @functools.lru_cache(maxsize=9)
+    def size(self):
+        return len(TABLE)
 
     @staticmethod
     def wrapped(number):
@@ -128,6 +136,49 @@ def test_a_digest_changes_with_the_code_s_behavior_alone(was: str, now: str, cha
         assert (code_digest(before[name]) != code_digest(after[name])) == changes, name
 
 
+@pytest.mark.parametrize(
+    ("was", "now"),
+    [
+        ("range(3)", "range(5)"),
+        ("pathlib.Path('a')", "pathlib.Path('b')"),
+        ("np.float32(0.1)", "np.float32(0.2)"),
+        ("np.array(['a', 1], dtype=object)", "np.array(['b', 1], dtype=object)"),
+        ("torch.tensor([1.0])", "torch.tensor([2.0])"),
+        ("re.compile('a')", "re.compile('b')"),
+        ("min", "max"),
+        ("np.minimum", "np.maximum"),
+        ("functools.cache(lambda: 1)", "functools.cache(lambda: 2)"),
+        ("functools.cached_property(lambda self: 1)", "functools.cached_property(lambda self: 2)"),
+        ("Slotted(1)", "Slotted(2)"),
+    ],
+)
+def test_a_digest_changes_with_a_constant_of_any_type(was: str, now: str) -> None:
+    head = "import dataclasses, functools, pathlib, re, numpy as np, torch\n"
+    head += "@dataclasses.dataclass(slots=True)\nclass Slotted:\n    size: int\n"
+    (before, again, after) = (
+        code_digest(code(f"{head}CONSTANT = {value}\ndef use():\n    return CONSTANT\n")["use"])
+        for value in (was, was, now)
+    )
+    assert before == again != after
+
+
+def test_a_digest_changes_with_the_parts_of_own_modules_that_code_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also of a module in a module, and with those of a package none."""
+    outer, inner = ModuleType("outer"), ModuleType("inner")
+    monkeypatch.setitem(sys.modules, "outer", outer)
+    monkeypatch.setitem(sys.modules, "inner", inner)
+    vars(outer).update(inner=inner, RATE=1, other=0)
+    exec("import outer\ndef twice():\n    return 2", vars(inner))
+    act = code("import outer, numpy\ndef act():\n    return outer.inner.twice() + outer.RATE + numpy.pi")["act"]
+    first = code_digest(act)
+    vars(outer).update(other=1)
+    assert code_digest(act) == first, "it is not named"
+    vars(outer).update(RATE=2)
+    second = code_digest(act)
+    exec("def twice():\n    return 3", vars(inner))
+    assert len({first, second, code_digest(act)}) == 3
+
+
 def test_code_is_the_same_in_another_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a script, and of a module that is in no file; whatever order the hashes of texts give its sets there."""
     unwritten = ModuleType("unwritten")
@@ -186,6 +237,19 @@ def test_a_script_needs_no_guard(from_stdin: bool, tmp_path: Path) -> None:
 def results(tmp_path: Path) -> api.Comparison:
     """A small bench of a class."""
     return imagine_bench.bench("arrow_puzzle", agents=["random", Shifting], out=tmp_path, **TWO_EPISODES)
+
+
+def test_a_class_of_an_equal_name_elsewhere_is_not_the_registered_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = ModuleType("first"), ModuleType("second")
+    for module, action in ((first, 1), (second, 2)):
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+        exec(_SOURCE.replace("return self.wrapped(int(observation.frame.sum()))", f"return {action}"), vars(module))
+    imagine_bench.register_agent("named", first.MyAgent, title="Named")
+    ran = [imagine_bench.bench("arrow_puzzle", agents=[each.MyAgent], out=tmp_path, **TWO_EPISODES)
+           for each in (first, second)]  # fmt: skip
+    assert [set(each.frame()["agent"]) for each in ran] == [{"named"}, {"MyAgent"}]
 
 
 def test_a_changed_class_resumes_no_run(results: api.Comparison, capsys: pytest.CaptureFixture[str]) -> None:

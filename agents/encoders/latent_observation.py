@@ -9,6 +9,7 @@ import numpy as np
 
 from imagine_bench.arrays import Action, Floats32, Frame
 from imagine_bench.errors import InvalidValueError, require_known
+from imagine_bench.interfaces import FRAME_PX
 
 from .encoder import Encoder, bundled_encoder
 
@@ -23,11 +24,18 @@ class LatentObservation(gymnasium.ObservationWrapper[Floats32, Action, Frame]):
     Raises:
         UnknownNameError: No encoder of this name is bundled; the message lists those that are.
         ArtefactError: There is no such file, or it is damaged.
-        InvalidValueError: The encoder reads frames otherwise than the environment's task declares.
+        InvalidValueError: The environment gives other observations, or the encoder reads frames otherwise than its task
+            declares.
     """
 
     def __init__(self, env: gymnasium.Env[Frame, Action], encoder: Encoder | Path | str) -> None:
         super().__init__(env)
+        seen = env.observation_space
+        if seen.shape != (FRAME_PX, FRAME_PX, 3) or seen.dtype != np.uint8:
+            raise InvalidValueError(
+                f"The environment gives {seen}; an encoder takes frames of {FRAME_PX} x {FRAME_PX} pixels alone. Leave "
+                "observation and size as they are by default."
+            )
         self.encoder = encoder if isinstance(encoder, Encoder) else Encoder.load(_path(encoder))
         reads = self.encoder.card.preprocessing
         declared = getattr(env.unwrapped, "preprocessing", None)

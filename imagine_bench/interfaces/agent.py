@@ -74,7 +74,8 @@ class AgentState:
     """All that an agent needs to go on as if never interrupted: weights, optimisers, memories, generators, counters."""
 
     arrays: Arrays  #: named numpy arrays; they become one safetensors file
-    values: dict[str, Any]  #: JSON-serialisable values
+    #: JSON-serialisable values; a resumed run has them as JSON does: lists in place of tuples, texts for all keys
+    values: dict[str, Any]
 
 
 class FrameEncoder(Protocol):

@@ -163,7 +163,7 @@ def require_seeds(seeds: tuple[int, ...]) -> tuple[int, ...]:
         raise InvalidValueError(f"seeds {brief(seeds)} must be one or more different integers from 0 to {SEEDS - 1}.")
     if len({is_tuning_seed(seed) for seed in seeds}) > 1:
         raise InvalidValueError(
-            f"seeds {seeds} mix tuning seeds (from {TUNING_SEEDS} on, tested on starts of their own) with "
+            f"seeds {brief(seeds)} mix tuning seeds (from {TUNING_SEEDS} on, tested on starts of their own) with "
             "reported ones; give them to separate benches."
         )
     return tuple(sorted(seeds))

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from imagine_bench import registry
 from imagine_bench.arrays import Arrays, Info, Macrostate, Observed
+from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Agent, Frame, Observation, State, TaskSpec
 from imagine_bench.interfaces.capabilities import (
     Imaginer,
@@ -75,16 +76,19 @@ def record_run(
 def q_table(names: Sequence[str], values: NDArray[np.float32], chosen: int) -> str:
     """Q-values (A,) as Markdown: a monospaced row each with a bar from zero, to the left where it is negative.
 
-    The one of index ``chosen``, which is carried out, is marked by an arrow head.
+    The one of index ``chosen``, which is carried out, is marked by an arrow head. The bar of an infinite one is as long
+    as the longest on its side; NaN has none.
     """
-    low = min(float(values.min()), 0.0)
-    high = max(float(values.max()), 0.0)
+    finite = values[np.isfinite(values)]
+    low = float(finite.min(initial=0.0))
+    high = float(finite.max(initial=0.0))
     cells_per_unit = _BAR_CELLS / (high - low or 1.0)
     room = round(-low * cells_per_unit)
     width = max(len(name) for name in names)
     rows = []
-    for index, (name, value) in enumerate(zip(names, values, strict=True)):
-        bar = "█" * round(abs(float(value)) * cells_per_unit)
+    lengths = abs(np.nan_to_num(values.astype(np.float64), posinf=high, neginf=low))
+    for index, (name, value, length) in enumerate(zip(names, values, lengths.tolist(), strict=True)):
+        bar = "█" * round(length * cells_per_unit)
         below, above = (bar, "") if value < 0 else ("", bar)
         rows.append(f"{'>' if index == chosen else ' '} {name:<{width}} {value:+7.2f} {below:>{room}}│{above}")
     return "\n".join(["```", *rows, "```", "\\> is the one it carries out; bars begin at zero."])
@@ -210,7 +214,9 @@ class _EpisodeRecorder:
         """The Q-values, a curve each and a table with bars; how unknown each macro-action is, a curve each."""
         names = self.spec.action_names
         if isinstance(self.agent, ValueReader):
-            values = self.agent.q_values(observation)
+            values = np.asarray(self.agent.q_values(observation), dtype=np.float32)
+            if values.shape != (len(names),):
+                raise InvalidValueError(f"q_values() gave the shape {values.shape}; give {len(names)} numbers.")
             self.recording.curves("/real/q_values", dict(zip(names, values, strict=True)))
             self.recording.text("/real/q_table", q_table(names, values, action))
         if isinstance(self.agent, NoveltyReader):

@@ -7,9 +7,11 @@ the constants and helper functions that it names. Code of any other module is im
 from __future__ import annotations
 
 import builtins
+import copyreg
 import dis
 import functools
 import hashlib
+import random
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -32,16 +34,20 @@ _NO_CODE = frozenset(
     )
 )
 """Attributes of a class that Python itself adds, or that change nothing that it does."""
+_CACHED = type(functools.cache(len))
 _ATTRIBUTES: Mapping[type, tuple[str, ...]] = {
     CodeType: ("co_code", "co_consts", "co_names", "co_varnames", "co_freevars"),
     MethodType: ("__func__", "__self__"),
     ModuleType: ("__name__",),
     classmethod: ("__func__",),
+    functools.cached_property: ("func",),
     functools.partial: ("func", "args", "keywords"),
     property: ("fget", "fset", "fdel"),
     staticmethod: ("__func__",),
+    _CACHED: ("__wrapped__",),
 }
 """The attributes that decide about an object of one of Python's own types."""
+_GENERATORS = (np.random.Generator, np.random.BitGenerator, np.random.RandomState, random.Random)
 
 
 @dataclass(frozen=True, repr=False)
@@ -52,6 +58,7 @@ class CodeByValue:
     pickled: bytes = field(compare=False)  #: the bytes of :mod:`cloudpickle`, each time others
     digest: str  #: twelve hex digits, see :func:`code_digest`
     module: str = field(default="", compare=False)  #: its module where that is of an installed package
+    home: str = field(default="", compare=False)  #: its module, whichever that is
 
     @classmethod
     def of(cls, target: Callable[..., Any]) -> CodeByValue:
@@ -73,7 +80,7 @@ class CodeByValue:
                 "itself, in its constructor, and keep them out of variables around it."
             ) from error
         module = str(getattr(target, "__module__", ""))
-        return cls(name, pickled, code_digest(target), module if _is_of_package(module) else "")
+        return cls(name, pickled, code_digest(target), module if _is_of_package(module) else "", module)
 
     def __str__(self) -> str:
         return f"the code of {self.name}"
@@ -116,28 +123,45 @@ def _unfindable_by_value() -> Iterator[None]:
     ]
     for module in modules:
         cloudpickle.register_pickle_by_value(module)
+    copyreg.pickle(_CACHED, _cached_by_value)
     try:
         yield
     finally:
+        copyreg.dispatch_table.pop(_CACHED, None)
         for module in modules:
             cloudpickle.unregister_pickle_by_value(module)
 
 
-def _described(value: object, seen: dict[int, int]) -> Iterator[str]:
-    """A value as lines of text that are the same in every process; ``seen`` are the objects so far."""
+def _cached_by_value(function: Any) -> str | tuple[Any, ...]:
+    """A function with a cache as pickles have it: by its name, or where a new process would not find that, as its code
+    and an empty cache.
+    """
+    if function.__module__ not in {"__main__", *cloudpickle.list_registry_pickle_by_value()}:
+        return str(function.__qualname__)
+    return _with_cache, (function.__wrapped__, function.cache_parameters())
+
+
+def _with_cache(function: Callable[..., Any], parameters: Mapping[str, Any]) -> Callable[..., Any]:
+    return functools.lru_cache(**parameters)(function)
+
+
+def _described(value: object, seen: dict[int, tuple[int, object]]) -> Iterator[str]:
+    """A value as lines of text that are the same in every process; ``seen`` are the objects so far, each with its place
+    among them.
+    """
     if value is None or isinstance(value, bool | int | float | complex | str | bytes):
         yield repr(value)
         return
-    if isinstance(value, np.ndarray):
+    if isinstance(value, np.ndarray) and not value.dtype.hasobject:
         yield f"array {value.dtype} {value.shape} {hashlib.sha256(value.tobytes()).hexdigest()}"
         return
     if isinstance(value, set | frozenset):
         yield from sorted("\n".join(_described(item, dict(seen))) for item in value)
         return
     if id(value) in seen:
-        yield f"object {seen[id(value)]}"
+        yield f"object {seen[id(value)][0]}"
         return
-    seen[id(value)] = len(seen)
+    seen[id(value)] = (len(seen), value)  # which keeps it, and so its id
     yield type(value).__qualname__
     for part in _parts(value):
         yield from _described(part, seen)
@@ -159,9 +183,32 @@ def _parts(value: object) -> Iterator[object]:
             yield f"{value.__module__}:{value.__qualname__}"
         else:
             yield from _parts_of_class(value) if isinstance(value, type) else _parts_of_function(value)
-    elif isinstance(value, SimpleNamespace) or not _is_known(type(value)):
+    elif isinstance(value, SimpleNamespace) or (not _is_known(type(value)) and hasattr(value, "__dict__")):
         yield type(value)
-        yield dict(sorted(getattr(value, "__dict__", {}).items()))
+        yield dict(sorted(vars(value).items()))
+    else:
+        yield from _pickled_parts(value)
+
+
+def _pickled_parts(value: Any) -> Iterator[object]:
+    """The parts that a pickle keeps of an object of any other type; of one that has none, such as a lock, nothing.
+
+    Nothing of a random generator, whose state changes as it draws; numpy's, Python's or torch's.
+    """
+    if isinstance(value, _GENERATORS) or hasattr(value, "initial_seed"):
+        return
+    reduced = copyreg.dispatch_table.get(type(value), lambda it: it.__reduce_ex__(4))
+    try:
+        if isinstance(value, np.ndarray) or hasattr(value, "requires_grad"):  # of objects, or torch's: with addresses
+            kept: Any = (str(value.dtype), value.tolist())
+        else:
+            kept = reduced(value)
+    except Exception:  # whatever it refuses with
+        return
+    if isinstance(kept, str):  # the pickle names it
+        yield f"{getattr(value, '__module__', None)}:{kept}"
+    else:
+        yield from (list(part) if isinstance(part, Iterator) else part for part in kept)
 
 
 def _parts_of_class(value: type) -> Iterator[object]:
@@ -173,13 +220,40 @@ def _parts_of_class(value: type) -> Iterator[object]:
 def _parts_of_function(value: FunctionType) -> Iterator[object]:
     yield from (value.__code__, value.__defaults__, value.__kwdefaults__)
     yield from (cell.cell_contents for cell in value.__closure__ or ())
-    yield {name: value.__globals__[name] for name in sorted(_globals(value.__code__)) if name in value.__globals__}
+    found = {name: value.__globals__[name] for name in sorted(_globals(value.__code__)) if name in value.__globals__}
+    yield found
+    yield from _parts_of_modules(found, _names(value.__code__))
+
+
+def _parts_of_modules(found: Mapping[str, object], names: set[str]) -> Iterator[object]:
+    """The parts of the user's own modules among the found objects, and of modules in these, that code may mean by its
+    names.
+    """
+    waiting = list(found.values())
+    done = list[ModuleType]()
+    while waiting:
+        module = waiting.pop()
+        if isinstance(module, ModuleType) and module not in done and not _is_installed(module.__name__):
+            done.append(module)
+            named = {name: vars(module)[name] for name in sorted(names & vars(module).keys())}
+            yield named
+            waiting += named.values()
 
 
 def _globals(code: CodeType) -> set[str]:
     """The names of variables outside that code reads, in its inner functions too."""
     names = {str(step.argval) for step in dis.get_instructions(code) if step.opname == "LOAD_GLOBAL"}
-    return names.union(*(_globals(inner) for inner in code.co_consts if isinstance(inner, CodeType)))
+    return names.union(*map(_globals, _inner(code)))
+
+
+def _names(code: CodeType) -> set[str]:
+    """The names of variables outside and of attributes that code reads, in its inner functions too."""
+    return {*code.co_names}.union(*map(_names, _inner(code)))
+
+
+def _inner(code: CodeType) -> list[CodeType]:
+    """The code of the functions that are made in a function."""
+    return [each for each in code.co_consts if isinstance(each, CodeType)]
 
 
 def _is_installed(module: str | None) -> bool:

@@ -15,7 +15,7 @@ from typing import TypedDict
 
 from imagine_bench import registry
 from imagine_bench.arrays import Info
-from imagine_bench.errors import DivergedError
+from imagine_bench.errors import DivergedError, InvalidValueError
 from imagine_bench.interfaces import Observation
 from imagine_bench.interfaces.capabilities import (
     ExternalTrainer,
@@ -223,7 +223,10 @@ def _training_episode(run: Run, *, demonstrated: bool) -> None:
 
 
 def train_externally(run: Run, agent: ExternalTrainer, test_at: Callable[[int], None]) -> None:
-    """Let the agent train in its own loop through all budgets, and test it, in an environment apart, at each."""
+    """Let the agent train in its own loop through all budgets, and test it, in an environment apart, at each.
+
+    Raises InvalidValueError: its loop ends before.
+    """
     budgets = run.protocol.budgets
     start_s = time.process_time()
 
@@ -240,6 +243,11 @@ def train_externally(run: Run, agent: ExternalTrainer, test_at: Callable[[int], 
     with closing(make_env(run.protocol, run.task.id)) as own:
         starts = training_starts(CountVisits(own, run.counters), run.spec.seed)
         agent.train(starts, episodes=budgets[-1], horizon=run.task.horizon, on_episode=on_episode)
+    if run.counters.episode < budgets[-1]:
+        raise InvalidValueError(
+            f"The training loop of agent {run.spec.agent!r} ended after {run.counters.episode:,} of {budgets[-1]:,} "
+            "episodes; it goes on until on_episode() answers False."
+        )
 
 
 def test(run: Run) -> EvaluationCounts:

@@ -152,8 +152,8 @@ def read_json(path: Path, what: str) -> Any:
 
 
 def sealed(values: Mapping[str, Json]) -> dict[str, Json]:
-    """Values with the digest of all of them, under ``seal``."""
-    return {**values, "seal": _seal(values)}
+    """Values with the digest of all of them, as a reader of their file will have them, under ``seal``."""
+    return {**values, "seal": _seal(json.loads(json.dumps(values)))}
 
 
 def read_sealed(path: Path, what: str) -> dict[str, Any]:

@@ -147,6 +147,23 @@ def test_several_rollouts_are_shown_only_where_rules_are_random(imagined: Path, 
     assert "/imagined/sampled_rollouts" not in contents(imagined)
 
 
+def test_values_without_end_are_shown_and_a_wrong_number_of_them_is_named(tmp_path: Path) -> None:
+    """As of an agent that tries every action first, or whose network has diverged; a tuple is as good as an array."""
+
+    class Values(FakeAgent):
+        values: Any = (-2.0, np.inf, 1.0, -np.inf, np.nan, 0.0)
+
+        def q_values(self, observation: Observation) -> Any:
+            return self.values
+
+    record(Values(), tmp_path / "all.rrd", name="random")
+    table = episodes.q_table([*"abcdef"], np.array(Values.values, dtype=np.float32), 1)
+    assert [line.count("█") for line in table.splitlines()[1:7]] == [11, 5, 5, 11, 0, 0]
+    for Values.values in ((1.0,), ((1.0,) * 6,), None):
+        with pytest.raises(InvalidValueError, match=r"q_values\(\) gave the shape .*; give 6 numbers"):
+            record(Values(), tmp_path / "none.rrd", name="random")
+
+
 def test_a_failure_leaves_a_closed_partial_file_and_what_was_there(tmp_path: Path) -> None:
     class Breaks(FakeImaginer):
         def q_values(self, observation: Observation) -> np.ndarray:

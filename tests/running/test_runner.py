@@ -24,7 +24,7 @@ from small_runs import KilledError, do, final_arrays, run_observed, same_but_for
 
 from imagine_bench import registry
 from imagine_bench.cli import observers
-from imagine_bench.errors import DivergedError
+from imagine_bench.errors import DivergedError, InvalidValueError
 from imagine_bench.exact.splits import split_of
 from imagine_bench.interfaces import Observation, Transition
 from imagine_bench.interfaces.episodes import Episodes
@@ -210,6 +210,24 @@ def test_a_loop_of_its_own_has_all_agents_starts_and_own_cpu_time(
     starts, others = result.training.starts.tolist(), usual.training.starts.tolist()
     assert starts == [*others[:2], [1, 2, 3, 0], *others[3:], starts[-1]] and len(starts) == 6
     assert result.training.lengths.tolist() == [1, *result.training_length.tolist()]
+
+
+class StopsEarly(bench_fakes.TableAgent):
+    """Ends its loop when its own budget is spent, whatever it is told."""
+
+    def train(self, env: Any, *, episodes: int, horizon: int, on_episode: Callable[[bool, int], bool]) -> None:
+        for _ in range(3):
+            env.reset()
+            on_episode(False, 1)
+
+
+@pytest.mark.usefixtures("own_names")
+def test_a_loop_that_ends_early_is_no_finished_run(tmp_path: Path) -> None:
+    made = AgentEntry(make=f"{__name__}:StopsEarly", needs_encoder=False, external_training_loop=True)
+    registry.AGENTS["early"] = made
+    with pytest.raises(InvalidValueError, match=r"agent 'early' ended after 3 of 5 episodes"):
+        do(tmp_path / "run", "early", agents=("early",), budgets=(2, 5), evaluation_episodes=1)
+    assert not (tmp_path / "run" / "DONE").exists()
 
 
 def test_an_agent_that_does_not_learn_is_tested_once(tmp_path: Path) -> None:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import random
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 from guest_packages import Guests
 from small_runs import TWO_EPISODES, Inline
 
@@ -19,7 +22,7 @@ from imagine_bench.judge.verify import verify_runs
 from imagine_bench.protocols import data
 from imagine_bench.protocols.control import protocol
 from imagine_bench.registry.builtin import OUR_AGENTS
-from imagine_bench.registry.by_value import CodeByValue
+from imagine_bench.registry.by_value import CodeByValue, code_digest
 from imagine_bench.regression.protocol import plan as plan_regression
 from imagine_bench.running.trained import load_trained
 from imagine_bench.store.bench_folder import read_control
@@ -139,6 +142,17 @@ def before(bench: Bench, module: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         folder = bench().folder
     assert read_control(folder).code == ()
     return folder
+
+
+@pytest.mark.parametrize("made", [np.random.default_rng, np.random.RandomState, random.Random, torch.Generator])
+def test_draws_of_a_generator_are_no_change_of_code(made: Callable[[], object]) -> None:
+    """One that a script makes without a seed is another at each call, and one of a module has drawn before the next."""
+
+    def digest() -> str:
+        rng = made()
+        return code_digest(lambda: rng)
+
+    assert digest() == digest() != code_digest(lambda: made)
 
 
 def test_a_bench_of_before_digests_goes_on(

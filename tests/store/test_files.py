@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -29,6 +30,7 @@ from imagine_bench.values import Json
 _HOLD = """
 import sys, time
 from pathlib import Path
+from typing import Any
 from imagine_bench.store.files import lock
 with lock(Path(sys.argv[1]), "The folder"):
     print("held", flush=True)
@@ -88,6 +90,14 @@ def test_a_sealed_file_without_its_seal_or_value_is_refused(tmp_path: Path) -> N
             read_sealed(path, "a file")
     write_json(path, whole)
     assert read_sealed(path, "a file") == {"seed": 1, "rate": 0.5}
+
+
+def test_a_sealed_file_of_keys_that_are_numbers_is_whole(tmp_path: Path) -> None:
+    """JSON makes texts of them, which are in another order: "10" comes before "2"."""
+    path = tmp_path / "state.json"
+    values: Any = {"counts": {2: 1, 10: (3, 4)}, "mixed": {1: 0, "a": 1}}
+    write_json(path, sealed(values))
+    assert read_sealed(path, "a file") == {"counts": {"2": 1, "10": [3, 4]}, "mixed": {"1": 0, "a": 1}}
 
 
 @pytest.mark.parametrize(

@@ -215,6 +215,38 @@ class _Forgets(_Sound):
         self.rng.bit_generator.state = state.values["rng"]
 
 
+class _KeysOfNumbers(_Sound):
+    """A table by side: in the JSON of a checkpoint its keys are texts, so a resumed run has lost it."""
+
+    def __init__(self, context: AgentContext) -> None:
+        super().__init__(context)
+        self.seen: dict[Any, int] = {}
+
+    def observe(self, transition: Any, *, episode: int) -> None:
+        side = transition.action % 2
+        self.seen[side] = self.seen.get(side, 0) + 1
+
+    def state(self) -> AgentState:
+        state = super().state()
+        return AgentState(arrays=state.arrays, values={**state.values, "seen": dict(self.seen)})
+
+    def restore(self, state: AgentState) -> None:
+        super().restore(state)
+        self.seen = dict(state.values["seen"])
+
+
+class _ReadsNumbers(_KeysOfNumbers):
+    def restore(self, state: AgentState) -> None:
+        super().restore(state)
+        self.seen = {int(side): count for side, count in self.seen.items()}
+
+
+class _NumpyValues(_Sound):
+    def state(self) -> AgentState:
+        state = super().state()
+        return AgentState(arrays=state.arrays, values={**state.values, "count": np.int64(1)})
+
+
 def _none(context: AgentContext) -> None:
     """A factory that forgot to return what it made."""
 
@@ -233,6 +265,9 @@ def _none(context: AgentContext) -> None:
         (_Sharing, "later learning alters a state that it gave before"),
         (_Uncertain, "it goes on to the same bits: it acts otherwise"),
         (_Forgets, "its later state differs"),
+        (_KeysOfNumbers, "its later state differs"),
+        (_ReadsNumbers, None),
+        (_NumpyValues, "int64 is not JSON serializable"),
     ],
 )
 def test_each_clause_of_the_contract_finds_its_fault(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from contextlib import closing
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -65,6 +66,13 @@ def test_an_encoder_of_other_preprocessing_is_refused(wrapped: bool) -> None:
         env = made if wrapped else made.unwrapped
         assert LatentObservation(env, "pick_place-clean").observation_space.shape == (4,)
         with pytest.raises(InvalidValueError, match="reads frames as 'gray_strips', this environment's task declares"):
+            LatentObservation(env, "arrow_puzzle-clean")
+
+
+@pytest.mark.parametrize("seen", [{"observation": "frame,state"}, {"observation": "state"}, {"size": 96}])
+def test_latents_of_other_observations_than_frames_are_refused(seen: dict[str, Any]) -> None:
+    with closing(gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic", **seen)) as env:
+        with pytest.raises(InvalidValueError, match="an encoder takes frames of 64 x 64 pixels alone"):
             LatentObservation(env, "arrow_puzzle-clean")
 
 
