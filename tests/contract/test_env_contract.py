@@ -309,7 +309,7 @@ def test_arrays_that_are_no_action_or_seed_are_refused(kinematic):
 @pytest.mark.parametrize(
     ("macrostates", "message"),
     [
-        (np.zeros((2, 3), np.int64), r"of shape \(N, 4\), not int64 of shape \(2, 3\)"),
+        *((np.zeros(shape, np.int64), r"of shape \(N, 4\), not int64 of shape") for shape in ((4,), (2, 3), (2, 5))),
         (np.zeros((2, 4)), r"must be integers of shape \(N, \d\), not float64 of shape \(2, 4\)"),
         (np.full((1, 4), -1), r"No macrostate \(-1, -1, -1, -1\); give one of 192, such as \(0, 0, 0, 0\)"),
     ],

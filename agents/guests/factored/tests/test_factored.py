@@ -252,12 +252,39 @@ def test_imagined_rollouts_go_and_end_as_in_the_world(trained: FactoredAgent) ->
     rollout = trained.imagine(frame(code), actions=actions, depth=4, rng=np.random.default_rng(1))
     greedy = trained.imagine(frame(code), actions=None, depth=6, rng=np.random.default_rng(1))
     assert np.array_equal(rollout.actions, actions) and rollout.accepted.all()
+    drawn = 255.0 * np.array([rollout.start_frame, *rollout.frames])[:, 0, : len(SIZES)]
     for index, action in enumerate(actions.tolist()):
+        assert tuple(drawn[index].round()) == code
+        assert np.array_equal(rollout.q_values[index], trained.q_values(Observation(frame=frame(code))))
         code, reward, ended = fake_codes.step(code, action)
-        assert tuple(rollout.macrostates[index]) == code
+        assert tuple(rollout.macrostates[index]) == tuple(drawn[index + 1].round()) == code
+        assert rollout.modal[index] < 0.1, "nothing is left to chance"
         assert rollout.rewards[index] == pytest.approx(reward, abs=1.6)
         assert ended == (index == 3) == (rollout.p_terminated[index] > 0.5)
     assert (greedy.p_terminated > 0.5).tolist() == [False] * (len(greedy.p_terminated) - 1) + [True]
+
+
+def test_all_outcomes_of_a_step_are_those_that_it_imagines(trained: FactoredAgent) -> None:
+    frames, rng = np.stack(list(map(frame, starts()))), np.random.default_rng(0)
+    found = trained.predict_outcomes(frames, rng)
+    for (row, code), action in itertools.product(enumerate(starts()), range(ACTIONS)):
+        one = trained.imagine(frames[row], actions=np.array([action]), depth=1, rng=rng)
+        goes_on = found.p_continues[row, action]
+        assert goes_on.sum() == pytest.approx(1.0 - one.p_terminated[0], abs=1e-6)
+        assert found.reward[row, action] == pytest.approx(one.rewards[0], abs=1e-5)
+        following, _, ended = fake_codes.step(code, action)
+        assert ended or tuple(found.macrostates[row, action, goes_on.argmax()]) == following
+    nothing = agent().predict_outcomes(frames, rng)
+    assert not nothing.p_continues.any() and not nothing.reward.any()
+
+
+@pytest.mark.parametrize(("factored", "sizes"), [(True, SIZES), (False, (18,))])
+def test_codes_are_read_and_drawn_as_the_encoder_does(factored: bool, sizes: Code) -> None:
+    eyes = CodePerception(fake_codes.FakeCodes(), factored=factored)  # type: ignore[arg-type]
+    codes = eyes.codes(np.stack(list(map(frame, starts()))))
+    assert eyes.sizes == sizes and len(set(codes)) == len(starts())
+    assert [*map(tuple, eyes.macrostates(codes).tolist())] == starts()
+    assert [*map(tuple, (255.0 * eyes.images(codes)[:, 0, : len(SIZES)]).round())] == starts()
 
 
 def test_what_follows_from_what_is_unknown_is_not_accepted_either() -> None:
@@ -283,14 +310,27 @@ def test_what_draws_it_can_be_read() -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "r_max", "explores_by"),
-    [(30.0, 40.0, "r_max"), (30.0, 30.0, "r_max"), (10.0, 10.0, "novelty"), (10.0, 12.0, "r_max")],
+    ("value", "r_max", "explores_by", "planning"),
+    [
+        (30.0, 40.0, "r_max", {}),
+        (30.0, 30.0, "r_max", {}),
+        (10.0, 10.0, "novelty", {}),
+        (10.0, 12.0, "r_max", {}),
+        (10.0, 10.0, "novelty", {"exploration_threshold": 0.9}),
+        (10.0, 10.0, "value", {"exploration_threshold": 0.91}),
+        (30.0, 40.0, "novelty", {"exploration": "curiosity"}),
+        (30.0, 40.0, "optimistic", {"exploration": "optimism"}),
+        (30.0, 40.0, "value", {"exploration": "random", "epsilon": 0.0}),
+    ],
 )
-def test_it_is_curious_only_where_the_unknown_earns_no_more(value: float, r_max: float, explores_by: str) -> None:
+def test_it_is_curious_only_where_the_unknown_earns_no_more(
+    value: float, r_max: float, explores_by: str, planning: dict[str, object]
+) -> None:
     """50 is the best reward seen; after the 20 macro-actions of a plan it is worth 17.9."""
-    learner = agent()
+    learner = agent(**{f"planning__{name}": given for name, given in planning.items()})
     learner.model.outcomes.rewards = np.array([-1.0, 50.0])
     found = {"value": np.array([value, 0.0]), "r_max": np.array([r_max, 1.0]), "novelty": np.array([0.5, 0.9])}
+    found["optimistic"] = np.array([2.0, 3.0])
     with mock.patch.object(learner, "_values", lambda _, objective="value": found[objective]):
         assert learner.exploring_values((0, 0, 0)) is found[explores_by]
 
