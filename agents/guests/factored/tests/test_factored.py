@@ -70,6 +70,11 @@ def test_nothing_is_learned_from_transitions_that_are_not_clear() -> None:
     assert reward_classes([*seen, *unclear]) == reward_classes(seen)
 
 
+def structured() -> StructuredModel:
+    context = AgentContext(n_actions=ACTIONS, preprocessing="gray_strips", encoder=None, seeds=SeedTree(0))
+    return StructuredModel(CodePerception(fake_codes.FakeCodes(), factored=True), context)  # type: ignore[arg-type]
+
+
 def test_by_chance_imagined_factors_change_independently() -> None:
     """Every factor goes one further in half of all steps: none tells of another, nor of another step or start."""
     rng = np.random.default_rng(0)
@@ -83,8 +88,7 @@ def test_by_chance_imagined_factors_change_independently() -> None:
                 "action_masks": np.ones((7, ACTIONS), dtype=np.int8),
             }
         )  # fmt: skip
-    context = AgentContext(n_actions=ACTIONS, preprocessing="gray_strips", encoder=None, seeds=SeedTree(0))
-    model = StructuredModel(CodePerception(fake_codes.FakeCodes(), factored=True), context)  # type: ignore[arg-type]
+    model = structured()
     model.fit(joined(found), rng)
     begun = np.array([(0, 1, 0), (2, 1, 1)])
     asked = np.stack([frame(code) for code in begun.tolist()])[:, None], np.zeros((2, 3), dtype=np.int64)
@@ -250,6 +254,12 @@ def test_forty_episodes_solve_every_start_of_the_tiny_task(trained: FactoredAgen
 def test_imagined_rollouts_go_and_end_as_in_the_world(trained: FactoredAgent) -> None:
     code, actions = (0, 2, 1), np.array([0, 1, 3, 1])
     rollout = trained.imagine(frame(code), actions=actions, depth=4, rng=np.random.default_rng(1))
+    model = structured()
+    model.model = trained.model
+    found = model.imagine(frame(code)[None, None], np.append(actions, 0)[None], 2, np.random.default_rng(2))
+    assert np.array_equal(found.pictures[0, 1, :4], (255.0 * rollout.frames).round())
+    assert found.rewards is not None and found.rewards[0, 1] == pytest.approx([*rollout.rewards, 0.0], abs=0.5)
+    assert found.p_ended is not None and found.p_ended[0, 1] == pytest.approx([*rollout.p_terminated, 1.0], abs=0.1)
     greedy = trained.imagine(frame(code), actions=None, depth=6, rng=np.random.default_rng(1))
     assert np.array_equal(rollout.actions, actions) and rollout.accepted.all()
     drawn = 255.0 * np.array([rollout.start_frame, *rollout.frames])[:, 0, : len(SIZES)]
@@ -290,9 +300,13 @@ def test_codes_are_read_and_drawn_as_the_encoder_does(factored: bool, sizes: Cod
 def test_what_follows_from_what_is_unknown_is_not_accepted_either() -> None:
     learner, rng, known_again = agent(), np.random.default_rng(0), 0
     live(learner, range(3), rng)
+    model = structured()
+    model.model = learner.model
     for code in starts():
         rollout = learner.imagine(frame(code), actions=rng.integers(ACTIONS, size=6), depth=6, rng=rng)
         unknown = rollout.epistemic > ACCEPTED
+        found = model.imagine(frame(code)[None, None], rollout.actions[None], 2, np.random.default_rng(0))
+        assert found.modal is not None and found.modal[0, 0] == pytest.approx(rollout.modal[0], abs=1e-6)
         first = int(unknown.argmax()) if unknown.any() else len(unknown)
         assert rollout.accepted.tolist() == [True] * first + [False] * (len(unknown) - first)
         known_again += not unknown[first:].all()

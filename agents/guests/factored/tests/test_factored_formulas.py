@@ -33,7 +33,7 @@ DYNAMICS = DynamicsSettings(
     fails=0.2,
     pseudo_fails=4.0,
 )
-SETTINGS = FactoredSettings(dynamics=DYNAMICS, planning=PlanningSettings(least_probability=0.1))
+SETTINGS = FactoredSettings(dynamics=DYNAMICS, planning=PlanningSettings(least_probability=0.1, branches=3))
 CODES = list(itertools.product(*map(range, SIZES)))
 
 
@@ -150,6 +150,10 @@ def test_dynamics_average_over_what_a_factor_may_depend_on(model: FactoredModel,
         assert found.expected[row, action] == pytest.approx(by_hand.expected)
         assert seen[row, action] == pytest.approx(seen_by_hand)
         assert found.unknown[row, action] == pytest.approx(by_hand.unknown)
+    many = np.tile(CODES, (20, 1))
+    np.testing.assert_allclose(model.dynamics.factors[factor].seen(many), np.tile(seen, (20, 1, 1)))
+    for one, more in zip(found, model.dynamics.predict(many)[factor], strict=True):
+        np.testing.assert_allclose(more, np.concatenate([one] * 20))
 
 
 def test_each_conjunction_has_a_number_of_its_own() -> None:
@@ -216,12 +220,14 @@ def test_what_follows_is_summed_over_all_that_may(model: FactoredModel) -> None:
     found = model.results(np.array(CODES), moves)
     causes = model.outcomes.causes
     assert causes is not None and len(causes.outcomes) == 2
-    dropped = 0
+    dropped = beyond = 0
     for (row, code), action in itertools.product(enumerate(CODES), range(ACTIONS)):
         factors = [predicted(factor, code, action)[0] for factor in range(2)]
         joint = {after: float(factors[0].expected[after[0]] * factors[1].expected[after[1]]) for after in CODES}
         likely = {after: share for after, share in joint.items() if share >= min(0.1, max(joint.values()))}
         dropped += len(joint) - len(likely)
+        beyond += max(0, len(likely) - 3)
+        likely = dict(sorted(likely.items(), key=lambda each: -each[1])[:3])
         reward = ends = untested = 0.0
         goes_on = {}
         for after, share in likely.items():
@@ -237,7 +243,7 @@ def test_what_follows_is_summed_over_all_that_may(model: FactoredModel) -> None:
         assert found.reward[row, action] == pytest.approx(reward)
         assert found.p_terminated[row, action] == pytest.approx(ends)
         assert found.unknown[row, action] == pytest.approx(unsure(factors, untested))
-    assert dropped > 0
+    assert dropped > 0 and beyond > 0
     for each in lived()[:3]:
         (probability,), (unknown,) = model.probabilities([each])
         factors = [predicted(factor, each.code, each.action)[0] for factor in range(2)]
