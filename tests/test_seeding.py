@@ -57,6 +57,4 @@ def test_bad_values_say_what_is_allowed():
         episode_seed("training", 2**24, 0)
     with pytest.raises(InvalidValueError, match="Seed -1 is negative"):
         SeedTree(-1)
-    assert len(seed_range("5-1004")) == 1000
-    with pytest.raises(InvalidValueError, match=r"'5-1005' are neither .*, of at most 1,000 seeds"):
-        seed_range("5-1005")
+    assert len(seed_range("5-1004")) == 1000, "the most"

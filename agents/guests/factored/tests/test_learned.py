@@ -6,7 +6,6 @@ import itertools
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
-from unittest import mock
 
 import numpy as np
 import pytest
@@ -223,37 +222,22 @@ def doubtful(transition: Transition, *, before: bool, after: bool) -> Transition
 
 
 def test_a_transition_is_clear_if_both_of_its_frames_are() -> None:
-    """Also once factors were found anew, and in a snapshot."""
+    """Also once factors were found anew, and in a snapshot; no other is a surprise, from which it learns."""
     rng = np.random.default_rng(0)
     learner, again = doubtful_agent(), doubtful_agent()
-    clear = []
+    clear, surprised = [], []
     for episode in range(12):
         for transition in played(None, rng):
             before, after = (rng.random(2) >= 0.2).tolist()
             learner.observe(doubtful(transition, before=before, after=after), episode=episode)
             clear.append((before, after))
+            surprised.append(learner.diagnostics()["model/unexpected"] > 0.0)
+    assert {all(each) for each, surprise in zip(clear, surprised, strict=True) if surprise} == {True}
     assert len(learner.perception.history) > 2
     assert [(row.code_is_clear, row.following_is_clear) for row in learner.replay] == clear
     assert [row.is_clear for row in learner.replay] == [all(each) for each in clear]
     again.restore(learner.state())
     assert again.replay == learner.replay
-
-
-@pytest.mark.parametrize(("before", "after"), [(True, True), (False, True), (True, False)])
-def test_it_plans_anew_after_clear_surprises_alone(before: bool, after: bool) -> None:
-    learner = doubtful_agent()
-    for episode in range(12):
-        for transition in played(None, np.random.default_rng(episode)):
-            learner.observe(doubtful(transition, before=True, after=True), episode=episode)
-    learner.classed = len(learner.replay)  # rewards are not due to be classed
-    surprise = doubtful(replace(transition, reward=7.5), before=before, after=after)
-    with (
-        mock.patch.object(learner.perception, "renew", return_value=False),
-        mock.patch.object(learner, "learn", wraps=learner.learn) as learned,
-    ):
-        learner.observe(surprise, episode=12)
-    assert learned.called == (before and after)
-    assert learner.replay[-1].reward == 7.5, "it is kept"
 
 
 def test_memory_takes_values_of_clear_frames_alone() -> None:

@@ -39,7 +39,9 @@ def test_the_dynamics_stay_and_the_outcomes_begin_anew(experienced: FactoredAgen
     learner = copy.deepcopy(experienced)
     assert isinstance(learner, TransferLearner)
     assert learner.diagnostics()["real_transitions"] == len(learner.replay)
+    assert learner.model.outcomes.starts
     learner.reset_for_new_task()
+    assert not learner.model.outcomes.starts, "another task may end where this one began"
     known = Dynamics(learner.perception.sizes, ACTIONS, learner.settings.dynamics)
     for row in learner.replay:
         known.add(np.array(row.code), row.action, np.array(row.following))
