@@ -15,10 +15,8 @@ from imagine_bench.rules import (
     evaluate,
     facts,
     fewest_actions,
-    greedy,
     horizon_optimum,
     optimal_policy,
-    require_macrostates,
     shortest_plans,
     states_of,
     states_of_play,
@@ -42,17 +40,6 @@ def test_an_episode_goes_on_wherever_its_goal_is_not_met(name, all_of_them, goin
     rules = registry.task(name).rules
     assert (len(states_of(rules)), len(states_of_play(rules))) == (all_of_them, going_on)
     assert set(rules.start_states) <= set(states_of_play(rules))
-
-
-@pytest.mark.parametrize("shape", [(4,), (2, 3), (2, 5), (1, 4, 1)])
-def test_macrostates_of_another_shape_are_refused(shape):
-    rules = registry.task("arrow_puzzle").rules
-    with pytest.raises(InvalidValueError, match=r"^Macrostates must be integers of shape \(N, 4\), not int64 of shape"):
-        require_macrostates(rules, np.zeros(shape, dtype=np.int64))
-    assert require_macrostates(rules, [rules.states[5], rules.states[9]]).tolist() == [
-        list(rules.states[5]),
-        list(rules.states[9]),
-    ]
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -91,8 +78,27 @@ def test_the_horizon_optimum_is_that_of_plain_recursion(parameters, horizon):
     tables = tabulate(rules)
     found = horizon_optimum(tables, horizon)
     np.testing.assert_allclose(found.success[tables.starts], _plainly(rules, horizon), atol=1e-12)
-    stationary = evaluate(tables, greedy(found.actions[-1].astype(np.int64), rules.n_actions), horizon)
-    assert (stationary.success <= found.success + 1e-12).all()
+
+
+def test_a_policy_is_worth_what_plain_recursion_says():
+    """Success, failure, return and length."""
+    rules, horizon = Wheels(n=2, slip=0.2, goal_change=0.1), 4
+    tables = tabulate(rules)
+    policy = np.random.default_rng(0).dirichlet(np.ones(rules.n_actions), len(tables.index)).T
+
+    @cache
+    def values(state, left):
+        found = np.zeros(4)
+        for action in range(rules.n_actions) if left else ():
+            for o in rules.outcomes(state, action):
+                after = (o.success, not o.success, 0, 0) if o.terminated else values(o.macrostate, left - 1)
+                share = policy[action, tables.index[state]] * o.probability
+                found += share * np.add((0, 0, o.reward, 1), after)
+        return found
+
+    found = evaluate(tables, policy, horizon)
+    columns = np.stack([found.success, found.failure, found.returns, found.length], axis=1)
+    np.testing.assert_allclose(columns[tables.starts], [values(start, horizon) for start in rules.start_states])
 
 
 def test_shortest_plans_are_those_of_a_search():

@@ -124,7 +124,7 @@ class Episodes:
         ends = np.cumsum(self.lengths)
         count = int(np.searchsorted(ends, transitions)) + 1
         truncated = self.truncated[:transitions].copy()
-        truncated[-1] = not self.terminated[transitions - 1]
+        truncated[-1] |= not self.terminated[transitions - 1]
         lengths = self.lengths[:count].copy()
         success = self.success[:count].copy()
         lengths[-1] -= ends[count - 1] - transitions

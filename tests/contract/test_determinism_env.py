@@ -181,6 +181,7 @@ HIDING = {"gesture": 0.5, "lag": 2, "fickle": 0.4, "distractors": 3}
 def test_a_state_goes_on_to_the_same_bits(task, execution, appearance, world):
     """In the middle of an episode, after something else was done, and in another environment."""
     options = {"execution": execution, "appearance": appearance, "physics": {"plan_error_mm": 1.0, "plan_error_deg": 1}}
+    options["motion_hz"] = 5.0
     env, other, stranger = (make(each, **options, **world) for each in (task, task, WORLDS[task == WORLDS[0]]))
     for seed, each in enumerate((env, other, stranger)):
         each.reset(seed=seed)
@@ -188,7 +189,8 @@ def test_a_state_goes_on_to_the_same_bits(task, execution, appearance, world):
     actions = (0, 2, 1) if execution == "physics" else (0, 2, 1, 3, 0)
 
     def goes_on(each):
-        return [each.agent_view(), *(each.step(action) for action in actions), each.reset(), each.data.qpos.copy()]
+        before = [each.agent_view(), each.motion().poses_in_world]
+        return [*before, *(each.step(action) for action in actions), each.reset(), each.data.qpos.copy()]
 
     state = pickle.loads(pickle.dumps(env.get_state()))
     expected = goes_on(env)

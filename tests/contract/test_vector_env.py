@@ -50,7 +50,7 @@ def walk_both(envs, steps, n_actions, *, mask):
         over = its[2] | its[3]
         ended += its[2].sum(), (its[3] & ~its[2]).sum()
         if mask and over.any():
-            again = (env.reset(options={"reset_mask": over.copy()}) for env in envs)
+            again = (env.reset(seed=step, options={"reset_mask": over.copy()}) for env in envs)
             assert_same(*again, f"reset after step {step}")
     return ended
 
@@ -128,26 +128,21 @@ def quiet_plan(rules, state, length, rng):
     return actions
 
 
-def test_each_lane_goes_its_own_pace_and_the_first_comes_first():
+def test_each_lane_goes_its_own_pace_and_sees_what_it_would_alone():
     rules, rng = registry.task("arrow_puzzle").rules, np.random.default_rng(5)
     plans = [quiet_plan(rules, START, 3, rng) for _ in range(N_LANES)]
     vector = make(autoreset_mode="Disabled")
     seen = [[frame] for frame in vector.reset(seed=7, options={"macrostate": START})[0]]
-    ends, received = np.zeros(N_LANES), []
     vector.send([plan[0] for plan in plans])
     for n in (2, 2, 1, 2, 1, 1):
         frames, *_, infos = vector.recv(n)
         lanes = infos["env_id"].tolist()
         assert infos["macrostate"].shape == (n, 4) and infos["_macrostate"].all()
-        ends[lanes] += infos["sim_time_s"]
-        received += ends[lanes].tolist()
         for lane, frame in zip(lanes, frames, strict=True):
             seen[lane].append(frame)
         going = [lane for lane in lanes if len(seen[lane]) <= 3]
-        ends[going] = received[-1]  # whoever is sent again begins now
         if going:
             vector.send([plans[lane][len(seen[lane]) - 1] for lane in going], going)
-    assert len(set(received)) > N_LANES and received == sorted(received), "lengths differ"
     for lane, plan in enumerate(plans):
         alone = gymnasium.make("imagine_bench/ArrowPuzzle-v0")
         expected = [alone.reset(seed=7 + lane, options={"macrostate": START})[0]]

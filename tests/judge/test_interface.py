@@ -21,9 +21,9 @@ from imagine_bench import registry
 from imagine_bench.arrays import Ints
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Frame, State
-from imagine_bench.interfaces.capabilities import ImaginedRollout
+from imagine_bench.interfaces.capabilities import ImaginedRollout, planned_actions
 from imagine_bench.interfaces.episodes import Episodes, joined
-from imagine_bench.interfaces.model import Imagined, require_imagined, weights_of
+from imagine_bench.interfaces.model import Imagined, require_imagined, until_the_end, weights_of
 from imagine_bench.judge import questions
 from imagine_bench.judge.models import AgentModel
 from imagine_bench.judge.predictions import Predictions, ask_together, evaluate
@@ -54,7 +54,11 @@ def test_what_is_wrong_is_one_sentence() -> None:
         ("of shape (3, 3", {"pictures": GOOD.pictures[:, :3], "probabilities": None, "rewards": None, "p_ended": None}),
         ("give uint8, or floats from 0 to 1", {"pictures": np.full((*SHAPE, 8, 8), 2.0)}),
         ("gave pictures of str", {"pictures": "a picture"}),
+        ("give uint8, or floats from 0 to 1", {"pictures": np.full((*SHAPE, 8, 8), -0.5)}),
+        ("gave pictures of int64; give uint8", {"pictures": np.zeros((*SHAPE, 8, 8), dtype=np.int64)}),
         ("gave rewards with NaN", {"rewards": np.full(SHAPE, np.nan)}),
+        ("gave epistemic with NaN or infinity", {"epistemic": np.full((3, 2), np.inf)}),
+        ("gave p_ended outside of [0, 1]", {"p_ended": np.full(SHAPE, 1.5)}),
         ("sum to 0.8 over S; they must sum to 1", {"probabilities": np.full(SHAPE, 0.2)}),
         ("probabilities outside of [0, 1]", {"probabilities": np.full(SHAPE, -0.25)}),
         ("accepted of float64; give an array of bool", {"accepted": np.zeros((3, 2))}),
@@ -63,6 +67,25 @@ def test_what_is_wrong_is_one_sentence() -> None:
     for words, changes in wrong:
         with pytest.raises(InvalidValueError, match=rf"^World model theirs: imagine\(\) .*{re.escape(words)}"):
             check(**changes)
+
+
+def test_after_an_end_nothing_is_earned() -> None:
+    rewards, ends = np.random.default_rng(0).random((2, 2, 3, 4))
+    counted, p_ended = until_the_end(rewards, ends)
+    for place in np.ndindex(2, 3):
+        goes_on = 1.0
+        for step in range(4):
+            assert counted[place][step] == pytest.approx(goes_on * rewards[place][step])
+            goes_on *= 1.0 - ends[place][step]
+            assert p_ended[place][step] == pytest.approx(1.0 - goes_on)
+
+
+def test_questions_to_an_imaginer_are_as_deep_as_asked() -> None:
+    assert planned_actions(np.array([0, 4, 1]), 2, 5) == [0, 4]
+    assert planned_actions(None, 2, 5) is None
+    for actions, depth in ((None, 0), ([], 2), ([0, 5], 2), ([-1], 2)):
+        with pytest.raises(InvalidValueError, match=r"give at least one|must lie in \[0, 5\)"):
+            planned_actions(None if actions is None else np.array(actions), depth, 5)
 
 
 def test_no_start_is_asked_about_twice_while_another_is_not_at_all() -> None:
@@ -144,9 +167,10 @@ def test_the_first_transitions_are_the_same_ones() -> None:
         frames = np.zeros((length + 1, 64, 64, 3), dtype=np.uint8)
         frames[:, 0, 0, 0] = np.arange(length + 1) + 10 * length
         ends = [False] * (length - 1) + [True]
-        known = {"actions": [0] * length, "rewards": [float(length)] * length, "truncated": [False] * length}
+        cut = [end and length > 2 for end in ends]  # at the time limit, too
+        known = {"actions": [0] * length, "rewards": [float(length)] * length, "truncated": cut}
         masks = np.ones((length + 1, 2), dtype=np.int8)
-        return {**known, "frames": frames, "action_masks": masks, "terminated": ends, "success": True}
+        return {**known, "frames": frames, "action_masks": masks, "terminated": ends, "success": length != 3}
 
     def transitions(of: Episodes) -> list[list[Any]]:
         """The frame before and after each, its reward and end."""
@@ -155,9 +179,10 @@ def test_the_first_transitions_are_the_same_ones() -> None:
 
     whole = joined([episode(length) for length in (2, 3, 4)])
     for count in range(1, 10):
-        assert transitions(whole.first(count)) == transitions(whole)[:count]
+        part = whole.first(count)
+        assert transitions(part) == transitions(whole)[:count]
+        assert part.truncated.tolist() == [*whole.truncated[: count - 1], count != 2]
+        assert part.success.tolist() == [count >= 2, False, count == 9][: len(part)], "lost where it is cut"
     assert whole.first(9).hash == whole.hash
-    assert whole.first(4).truncated.tolist() == [False, False, False, True]
-    assert whole.first(4).success.tolist() == [True, False]
     with pytest.raises(InvalidValueError, match="10 transitions of 9"):
         whole.first(10)

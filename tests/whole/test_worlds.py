@@ -88,8 +88,9 @@ def episodes(task: str) -> str:
                 state, reward, terminated, truncated, info = env.step(action)
                 after = tuple(info["macrostate"].tolist())
                 (outcome,) = (each for each in spec.rules.outcomes(before, action) if each.macrostate == after)
-                found = (reward, terminated, bool(info["is_success"]))
-                assert found == (outcome.reward, outcome.terminated, outcome.success)
+                found = (reward, terminated, info["is_success"], info["legal"])
+                legal = outcome.success or not outcome.terminated
+                assert found == (outcome.reward, outcome.terminated, outcome.success, legal)
                 ended = terminated or truncated
                 words = "success" if info["is_success"] else "failure" if terminated else "cut" if truncated else ""
                 lines.append([action, info["macrostate"], info["shown"], reward, words])

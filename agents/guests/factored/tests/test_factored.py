@@ -70,6 +70,11 @@ def test_nothing_is_learned_from_transitions_that_are_not_clear() -> None:
     assert reward_classes([*seen, *unclear]) == reward_classes(seen)
 
 
+def structured() -> StructuredModel:
+    context = AgentContext(n_actions=ACTIONS, preprocessing="gray_strips", encoder=None, seeds=SeedTree(0))
+    return StructuredModel(CodePerception(fake_codes.FakeCodes(), factored=True), context)  # type: ignore[arg-type]
+
+
 def test_by_chance_imagined_factors_change_independently() -> None:
     """Every factor goes one further in half of all steps: none tells of another, nor of another step or start."""
     rng = np.random.default_rng(0)
@@ -83,8 +88,7 @@ def test_by_chance_imagined_factors_change_independently() -> None:
                 "action_masks": np.ones((7, ACTIONS), dtype=np.int8),
             }
         )  # fmt: skip
-    context = AgentContext(n_actions=ACTIONS, preprocessing="gray_strips", encoder=None, seeds=SeedTree(0))
-    model = StructuredModel(CodePerception(fake_codes.FakeCodes(), factored=True), context)  # type: ignore[arg-type]
+    model = structured()
     model.fit(joined(found), rng)
     begun = np.array([(0, 1, 0), (2, 1, 1)])
     asked = np.stack([frame(code) for code in begun.tolist()])[:, None], np.zeros((2, 3), dtype=np.int64)
@@ -250,22 +254,58 @@ def test_forty_episodes_solve_every_start_of_the_tiny_task(trained: FactoredAgen
 def test_imagined_rollouts_go_and_end_as_in_the_world(trained: FactoredAgent) -> None:
     code, actions = (0, 2, 1), np.array([0, 1, 3, 1])
     rollout = trained.imagine(frame(code), actions=actions, depth=4, rng=np.random.default_rng(1))
+    model = structured()
+    model.model = trained.model
+    found = model.imagine(frame(code)[None, None], np.append(actions, 0)[None], 2, np.random.default_rng(2))
+    assert np.array_equal(found.pictures[0, 1, :4], (255.0 * rollout.frames).round())
+    assert found.rewards is not None and found.rewards[0, 1] == pytest.approx([*rollout.rewards, 0.0], abs=0.5)
+    assert found.p_ended is not None and found.p_ended[0, 1] == pytest.approx([*rollout.p_terminated, 1.0], abs=0.1)
     greedy = trained.imagine(frame(code), actions=None, depth=6, rng=np.random.default_rng(1))
     assert np.array_equal(rollout.actions, actions) and rollout.accepted.all()
+    drawn = 255.0 * np.array([rollout.start_frame, *rollout.frames])[:, 0, : len(SIZES)]
     for index, action in enumerate(actions.tolist()):
+        assert tuple(drawn[index].round()) == code
+        assert np.array_equal(rollout.q_values[index], trained.q_values(Observation(frame=frame(code))))
         code, reward, ended = fake_codes.step(code, action)
-        assert tuple(rollout.macrostates[index]) == code
+        assert tuple(rollout.macrostates[index]) == tuple(drawn[index + 1].round()) == code
+        assert rollout.modal[index] < 0.1, "nothing is left to chance"
         assert rollout.rewards[index] == pytest.approx(reward, abs=1.6)
         assert ended == (index == 3) == (rollout.p_terminated[index] > 0.5)
     assert (greedy.p_terminated > 0.5).tolist() == [False] * (len(greedy.p_terminated) - 1) + [True]
 
 
+def test_all_outcomes_of_a_step_are_those_that_it_imagines(trained: FactoredAgent) -> None:
+    frames, rng = np.stack(list(map(frame, starts()))), np.random.default_rng(0)
+    found = trained.predict_outcomes(frames, rng)
+    for (row, code), action in itertools.product(enumerate(starts()), range(ACTIONS)):
+        one = trained.imagine(frames[row], actions=np.array([action]), depth=1, rng=rng)
+        goes_on = found.p_continues[row, action]
+        assert goes_on.sum() == pytest.approx(1.0 - one.p_terminated[0], abs=1e-6)
+        assert found.reward[row, action] == pytest.approx(one.rewards[0], abs=1e-5)
+        following, _, ended = fake_codes.step(code, action)
+        assert ended or tuple(found.macrostates[row, action, goes_on.argmax()]) == following
+    nothing = agent().predict_outcomes(frames, rng)
+    assert not nothing.p_continues.any() and not nothing.reward.any()
+
+
+def test_whole_codes_are_read_and_drawn_as_the_encoder_does() -> None:
+    eyes = CodePerception(fake_codes.FakeCodes(), factored=False)  # type: ignore[arg-type]
+    codes = eyes.codes(np.stack(list(map(frame, starts()))))
+    assert eyes.sizes == (18,) and len(set(codes)) == len(starts())
+    assert [*map(tuple, eyes.macrostates(codes).tolist())] == starts()
+    assert [*map(tuple, (255.0 * eyes.images(codes)[:, 0, : len(SIZES)]).round())] == starts()
+
+
 def test_what_follows_from_what_is_unknown_is_not_accepted_either() -> None:
     learner, rng, known_again = agent(), np.random.default_rng(0), 0
     live(learner, range(3), rng)
+    model = structured()
+    model.model = learner.model
     for code in starts():
         rollout = learner.imagine(frame(code), actions=rng.integers(ACTIONS, size=6), depth=6, rng=rng)
         unknown = rollout.epistemic > ACCEPTED
+        found = model.imagine(frame(code)[None, None], rollout.actions[None], 2, np.random.default_rng(0))
+        assert found.modal is not None and found.modal[0, 0] == pytest.approx(rollout.modal[0], abs=1e-6)
         first = int(unknown.argmax()) if unknown.any() else len(unknown)
         assert rollout.accepted.tolist() == [True] * first + [False] * (len(unknown) - first)
         known_again += not unknown[first:].all()
@@ -283,14 +323,27 @@ def test_what_draws_it_can_be_read() -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "r_max", "explores_by"),
-    [(30.0, 40.0, "r_max"), (30.0, 30.0, "r_max"), (10.0, 10.0, "novelty"), (10.0, 12.0, "r_max")],
+    ("value", "r_max", "explores_by", "planning"),
+    [
+        (30.0, 40.0, "r_max", {}),
+        (30.0, 30.0, "r_max", {}),
+        (10.0, 10.0, "novelty", {}),
+        (10.0, 12.0, "r_max", {}),
+        (10.0, 10.0, "novelty", {"exploration_threshold": 0.9}),
+        (10.0, 10.0, "value", {"exploration_threshold": 0.91}),
+        (30.0, 40.0, "novelty", {"exploration": "curiosity"}),
+        (30.0, 40.0, "optimistic", {"exploration": "optimism"}),
+        (30.0, 40.0, "value", {"exploration": "random", "epsilon": 0.0}),
+    ],
 )
-def test_it_is_curious_only_where_the_unknown_earns_no_more(value: float, r_max: float, explores_by: str) -> None:
+def test_it_is_curious_only_where_the_unknown_earns_no_more(
+    value: float, r_max: float, explores_by: str, planning: dict[str, object]
+) -> None:
     """50 is the best reward seen; after the 20 macro-actions of a plan it is worth 17.9."""
-    learner = agent()
+    learner = agent(**{f"planning__{name}": given for name, given in planning.items()})
     learner.model.outcomes.rewards = np.array([-1.0, 50.0])
     found = {"value": np.array([value, 0.0]), "r_max": np.array([r_max, 1.0]), "novelty": np.array([0.5, 0.9])}
+    found["optimistic"] = np.array([2.0, 3.0])
     with mock.patch.object(learner, "_values", lambda _, objective="value": found[objective]):
         assert learner.exploring_values((0, 0, 0)) is found[explores_by]
 

@@ -106,10 +106,16 @@ def test_what_was_covered_is_remembered_and_nothing_else(
 
 
 def watched(learner: LearnedPerceptionAgent, episodes: range, *, covered: bool = False, worth: float = 1.0) -> None:
-    """Let it learn from episodes of drawn macro-actions, whose rewards are multiplied by their worth."""
+    """Let it learn from episodes of drawn macro-actions, whose rewards are multiplied by their worth.
+
+    After each episode it has learned from the codes that it acted on.
+    """
     for episode in episodes:
         for transition in played(None, np.random.default_rng(episode), covered=covered):
             learner.observe(replace(transition, reward=worth * transition.reward), episode=episode)
+        if memory := learner.perception.memory:
+            found = [row._replace(code=row.code[:-1], following=row.following[:-1]) for row in learner.replay]
+            assert learner.replay == remembering(found, learner.perception.begins, memory)
 
 
 @pytest.fixture(scope="module")
@@ -122,10 +128,8 @@ def rememberer() -> LearnedPerceptionAgent:
 def test_from_images_it_learns_to_remember_hidden_values(
     rememberer: LearnedPerceptionAgent,
 ) -> None:
-    seen, memory = rememberer.perception, rememberer.perception.memory
-    assert memory is not None and rememberer.model.memory == memory
-    found = [row._replace(code=row.code[:-1], following=row.following[:-1]) for row in rememberer.replay]
-    assert rememberer.replay == remembering(found, seen.begins, memory), "it learns from the codes that it acts on"
+    assert rememberer.perception.memory is not None
+    assert rememberer.model.memory == rememberer.perception.memory
     ends = [
         list(played(rememberer, np.random.default_rng(100 + each), covered=True, steps=3))[-1] for each in range(30)
     ]

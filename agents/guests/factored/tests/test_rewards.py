@@ -150,11 +150,12 @@ def test_a_resumed_run_classes_rewards_by_the_same_transitions(begins: int) -> N
 
 def test_a_state_with_one_column_of_what_is_clear_is_taken_up() -> None:
     """As agents kept it for some hours of 2026-11-30: both codes of a transition were clear, or neither."""
-    learner = fake_codes.agent()
+    learner, begins = fake_codes.agent(), []
     for episode in range(5):
         learner.begin_episode()
-        for row in fake_codes.drawn(np.random.default_rng(episode)):
+        for step, row in enumerate(fake_codes.drawn(np.random.default_rng(episode))):
             learner.observe(fake_codes.transition(row.code, row.action), episode=episode)
+            begins.append(step == 0)
     state = learner.state()
     arrays = dict(state.arrays)
     arrays["replay/is_clear"] = np.arange(len(learner.replay)) % 2 == 0
@@ -162,7 +163,7 @@ def test_a_state_with_one_column_of_what_is_clear_is_taken_up() -> None:
     resumed = fake_codes.agent()
     resumed.restore(replace(state, arrays=arrays))
     known = [(row.code_is_clear, row.following_is_clear) for row in resumed.replay]
-    assert len(known) > 1
+    assert len(known) > 1 and [row.is_first for row in resumed.replay] == begins
     assert known == [(place % 2 == 0,) * 2 for place in range(len(known))]
 
 

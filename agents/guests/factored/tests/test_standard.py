@@ -150,32 +150,24 @@ def test_values_are_found_and_read_behind_a_nuisance(nuisance: str) -> None:
     assert pairs(appearance.find(whole), whole, codes) == [VALUES] * len(PLACES)
 
 
-def test_noise_is_taken_away_and_new_things_are_not() -> None:
-    rng = np.random.default_rng(3)
-    _, frames = drawn(3)
-    standard = standard_of(noisy(frames, rng))
-    strange = frames[:5].copy()
-    strange[:, 40:52, 2:14] = 240
-    clean = standard.of(noisy(strange, rng))
-    before = noisy(strange, rng).astype(float) - strange
-    assert (clean - strange)[:, 5:25].std() < 0.35 * before[:, 5:25].std()
-    assert (clean[:, 42:50, 4:12].mean(axis=(1, 2)) > 200).all(), "no frame showed this before, and it stays"
-
-
-@pytest.mark.parametrize("brightness", [0.5, 0.7, 1.0, 1.3])
-def test_noise_is_taken_away_in_dark_and_in_bright_frames(brightness: float) -> None:
+@pytest.mark.parametrize(
+    ("brightness", "lit", "where", "least"),
+    [*((each, True, np.s_[31:39, 16:60], 140) for each in (0.5, 0.7, 1.0, 1.3)), (1.0, False, np.s_[5:25], 165)],
+)
+def test_noise_is_taken_away_in_dark_and_in_bright_frames(
+    brightness: float, lit: bool, where: tuple[slice, ...], least: float
+) -> None:
     """Dividing a frame by its light changes its noise by as much; a new thing stays where that is less."""
     rng = np.random.default_rng(5)
     _, frames = drawn(5)
-    standard = standard_of(noisy(shadowed(frames, rng), rng))
-    assert corrections(standard) == {"light", "noise"}
+    standard = standard_of(noisy(shadowed(frames, rng) if lit else frames, rng))
+    assert corrections(standard) == ({"light", "noise"} if lit else {"noise"})
     strange = frames[:5].copy()
     strange[:, 40:52, 2:14] = 190
     clean = standard.of(noisy(brightness * strange, rng))
-    background = np.s_[:, 31:39, 16:60]
-    assert (clean - strange)[background].std() < 0.35 * 20.0 / brightness
+    assert np.array([each[where] for each in clean - strange]).std() < 0.35 * 20.0 / brightness
     if brightness >= 1.0:
-        assert clean[:, 43:49, 5:11].mean() > 110 + 30, "the background is 110"
+        assert clean[:, 43:49, 5:11].mean(axis=(1, 2)).min() > least, "the background is 110"
 
 
 def test_most_hidden_pixels_are_no_numbers_and_few_others() -> None:

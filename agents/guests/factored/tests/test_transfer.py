@@ -17,6 +17,7 @@ from imagine_bench_factored.dynamics import Dynamics
 from imagine_bench_factored.factors import CodeTransition
 from imagine_bench_factored.outcomes import OutcomeModel
 from imagine_bench_factored.settings import OutcomeSettings
+from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Observation
 from imagine_bench.interfaces.capabilities import Label, QueryingAgent, TransferLearner
@@ -38,7 +39,9 @@ def test_the_dynamics_stay_and_the_outcomes_begin_anew(experienced: FactoredAgen
     learner = copy.deepcopy(experienced)
     assert isinstance(learner, TransferLearner)
     assert learner.diagnostics()["real_transitions"] == len(learner.replay)
+    assert learner.model.outcomes.starts
     learner.reset_for_new_task()
+    assert not learner.model.outcomes.starts, "another task may end where this one began"
     known = Dynamics(learner.perception.sizes, ACTIONS, learner.settings.dynamics)
     for row in learner.replay:
         known.add(np.array(row.code), row.action, np.array(row.following))
@@ -78,18 +81,28 @@ def test_an_earlier_outcome_is_believed_by_its_tested_causes() -> None:
         probability, _ = learner.predict(np.array([(3, 3)] * 2), np.zeros(2, dtype=np.int64), codes)
         return [float(row @ (learner.rewards == good)) for row, good in zip(probability, (-5.0, 5.0), strict=True)]
 
+    def strengths() -> NDArray[np.float64]:
+        """Of the third wall and the third goal as causes."""
+        assert learner.causes is not None
+        numbers = learner.conjunctions.next.numbers(np.array([(2, 3), (3, 2)]))[:, -1]
+        pairs = zip((-5.0, 5.0), numbers, strict=True)
+        return np.array([learner.causes.strength[learner.outcomes.index((end, True)), cause] for end, cause in pairs])
+
     for _ in range(5):
         add(-5.0, (0, 3), (1, 3), (2, 3))
         add(5.0, (3, 0), (3, 1), (3, 2))
         add(-1.0, (3, 3), *itertools.product(range(3), repeat=2))
     assert min(expected()) > 0.9
+    earlier = strengths()
     learner.reset_for_new_task()
     add(-1.0, (3, 3))
-    told = expected()
+    assert expected() and strengths() == pytest.approx(0.5 * earlier)
     add(-5.0, (0, 3), (1, 3))
     add(-1.0, (3, 0), (3, 1))
     wall, goal = expected()
-    assert wall > 0.65 > told[0] + 0.1 and goal < 0.35 < told[1] - 0.1
+    assert wall > 0.65 and goal < 0.35
+    held = np.array([2.0, 0.0])  # of two tests; pseudo_causes more are worth transfer_weight
+    assert strengths() == pytest.approx((2.0 * 0.5 + held) / (2.0 + 2.0) * earlier)
 
 
 # --- queries -----------------------------------------------------------------------------------------------------
