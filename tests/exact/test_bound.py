@@ -6,13 +6,10 @@ from collections.abc import Iterable
 from functools import cache
 from itertools import product
 
-import numpy as np
 import pytest
 
-from imagine_bench import registry
 from imagine_bench.exact.bound import lower_bound
 from imagine_bench.exact.factors import factor_graph, machine
-from imagine_bench.exact.learner import learn
 from imagine_bench.interfaces import Outcome, State
 
 HORIZON = 3
@@ -120,12 +117,3 @@ def test_a_bound_by_hand() -> None:
     assert bound(SHORT) == 2
     assert bound(SHORT, share=0.7) == 0, "one guess in two leaves 75 %"
     assert bound(RING) == 0
-
-
-def test_all_twelve_pairs_of_names_must_be_known() -> None:
-    """3 cubes with 4 directions each: 12 cells of two names. Without chance, a transition shows one pair."""
-    spec = registry.task("arrow_puzzle")
-    full = machine(spec.rules)
-    graph = factor_graph(full)
-    assert lower_bound(full, graph, spec.horizon) == 12
-    assert learn(full, graph, spec.horizon, np.random.default_rng(0)).transitions >= 12, "a cautious learner's cost"

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from itertools import pairwise
 
 import numpy as np
 import pytest
 from machines import Wheels, spec_of
 from scipy import stats
 
-from imagine_bench.exact import learner
 from imagine_bench.exact.certificate import certificate, certificate_rows
 from imagine_bench.exact.factors import factor_graph, machine
 from imagine_bench.exact.learner import learn
@@ -86,20 +84,6 @@ def test_a_learner_that_is_done_has_seen_what_it_needs(parameters):
     assert min(run.transitions for run in runs) >= 24 * 0.7
     again = learn(full, graph, 12, np.random.default_rng(0))
     assert again == runs[0]
-
-
-def test_a_learner_looks_no_further_than_its_episode_goes_on(monkeypatch):
-    full, left = machine(Wheels(n=2)), []
-    choose = learner.CautiousLearner.choose
-
-    def look(self, row, most, rng):
-        left.append(most)
-        return choose(self, row, most, rng)
-
-    monkeypatch.setattr(learner.CautiousLearner, "choose", look)
-    run = learner.learn(full, factor_graph(full), 3, np.random.default_rng(0))
-    assert len(left) == run.transitions and left.count(3) == run.episodes
-    assert all(later in {now - 1, 3} for now, later in pairwise(left)) and min(left) == 1
 
 
 def test_the_cost_of_learning_is_a_mean_with_standard_error():

@@ -15,7 +15,6 @@ from imagine_bench.exact.certificate import certificate, certificate_rows
 from imagine_bench.exact.memoryless import best_without_memory
 from imagine_bench.interfaces import Outcome
 from imagine_bench.rules import states_of
-from imagine_bench.tools.describe import describe_task
 
 
 class _NowAndThen(Glimpse):
@@ -186,11 +185,6 @@ def test_too_many_beliefs_leave_a_bound_and_say_so(monkeypatch):
     monkeypatch.setattr("imagine_bench.exact.beliefs.MOST", 5)
     found = certificate(spec_of(Wheels(n=2, goal_change=0.3), 3, Glimpse(finger="first")))
     assert found.beliefs is None and found.optimum == found.seen_optimum
-
-
-def test_describe_tells_the_optimum_with_memory_from_that_of_everything_seen():
-    page = describe_task("arrows:cubes=2,horizon=3,gesture=0.5")
-    assert "\noptimum         94.4 %; if every frame showed everything, 100.0 %, with a return of 49.33\n" in page
 
 
 def test_a_policy_that_was_not_searched_has_no_success(monkeypatch):

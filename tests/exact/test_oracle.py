@@ -14,6 +14,7 @@ from imagine_bench import registry
 from imagine_bench.exact.beliefs import BeliefRules, OptimalPolicy, optimal_policy_of
 from imagine_bench.exact.certificate import optimum
 from imagine_bench.interfaces import AgentContext
+from imagine_bench.rules import horizon_optimum, tabulate
 from imagine_bench.running.evaluation import play
 from imagine_bench.seeding import SeedTree
 
@@ -99,7 +100,39 @@ def test_what_the_oracle_knew_of_an_episode_is_forgotten_in_the_next(sight):
 
 
 def test_with_too_many_beliefs_it_votes(monkeypatch):
+    """Each macrostate for the macro-action that is best there, by its probability; the last frame shows the start."""
     monkeypatch.setattr("imagine_bench.exact.beliefs.MOST", 3)
-    spec = registry.task("arrows:forbid=none,lag=1")
-    assert OptimalPolicy(spec.rules, spec.sight, spec.horizon)._rows == {}
-    assert all(_successes(spec, _oracle(spec), 20))  # it knows where it is, as nothing here is random
+    rules, horizon = Wheels(slip=0.3), 4
+    policy = OptimalPolicy(rules, Glimpse(lag=1), horizon)
+    tables = tabulate(rules)
+    best = horizon_optimum(tables, horizon).actions[horizon - 2]
+    apart = 0
+    for start in rules.start_states:
+        outcomes = rules.outcomes(start, policy(start, 0))
+        stays, turned = (best[tables.index[each.macrostate]] for each in outcomes)
+        if not outcomes[1].terminated:
+            apart += stays != turned
+            assert policy(start, 1) == turned, "seven times of ten"
+    assert apart > 10
+
+
+@pytest.mark.parametrize("lag", [0, 2])
+def test_after_a_frame_that_cannot_be_it_goes_on_from_what_is_seen(lag):
+    """As if that had stood there for long. No macro-action turns all wheels."""
+    rules, horizon = Wheels(), 8
+    tables = tabulate(rules)
+    best = horizon_optimum(tables, horizon).actions
+    policy, latest = OptimalPolicy(rules, Glimpse(lag=lag), horizon), 0
+    for start in rules.start_states:
+        policy(start, 0)
+        now = state = (*((each + 1) % 4 for each in start[:-1]), start[-1])
+        for step in range(1, 2 if lag == 0 else 6):
+            if rules.is_terminal(now):
+                break
+            action = policy(state if step > lag else start, step)
+            if step > lag:
+                assert action == best[7 - step, tables.index[now]]
+                (outcome,) = rules.outcomes(now, action)
+                now = outcome.macrostate
+                latest = max(latest, step)
+    assert latest == (5 if lag else 1)

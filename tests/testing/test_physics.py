@@ -2,8 +2,11 @@
 
 import json
 from contextlib import suppress
+from dataclasses import replace
 from types import SimpleNamespace
 
+import gymnasium
+import numpy as np
 import pytest
 
 from imagine_bench import registry
@@ -16,8 +19,6 @@ from imagine_bench.testing.physics import (
     measure_fidelity,
     slips,
 )
-
-SLIPPERY = physics.PhysicsSettings.of({"pad_friction": 0.01})
 
 
 def test_fidelity_and_margins_are_measured_and_kept(tmp_path, monkeypatch, capsys):
@@ -38,24 +39,92 @@ def test_fidelity_and_margins_are_measured_and_kept(tmp_path, monkeypatch, capsy
     assert "| pad_friction | 0.01 | 0 of 4 | 0.000 to " in capsys.readouterr().out
 
 
-def test_each_walk_and_each_trial_has_a_start_of_its_own(monkeypatch):
-    """And a walk ends with its first fault."""
-    monkeypatch.setattr(physics, "_WALKS", 2)
-    make, seeds = physics.make_env, []
+SEEDS = []
+NOTHING = (0, 0, 0)
+SCRIPT = {
+    0: ("", (3, 4, 0), (0, -0.5, 0), 92),
+    1: ("slips", (0, -2, 0), NOTHING, 0),
+    2: ("dropped", NOTHING, NOTHING, 0),
+    3: ("", NOTHING, (50, 0, 100), 0),
+}
+"""By macro-action: what happens, and how far the object that it moves, and the other one, are off then, in mm and
+degrees.
+"""
 
-    def slippery(spec, **_):
-        env = make(spec, physics=SLIPPERY)
-        reset = env.reset
-        monkeypatch.setattr(env, "reset", lambda **given: (seeds.append(given["seed"]), reset(**given))[1])
-        return env
 
-    monkeypatch.setattr(physics, "make_env", slippery)
-    spec = registry.task("pick_place")
-    found = physics.walk(spec, "true")
-    assert (found["lengths"], found["as_ruled"], len(found["faults"])) == ([1, 1], 0, 2)
-    assert len(set(seeds)) == 2
-    seeds.clear()
-    assert physics.as_ruled(spec, SLIPPERY, 5) == 0 and len(set(seeds)) == 5
+class Scripted(gymnasium.Env):
+    """Two cubes on a table. In physics they are moved as is written down, otherwise exactly."""
+
+    def __init__(self, execution="physics", appearance="clean", physics=None):
+        self.real = execution == "physics"
+        self.count = 0
+        self.world = self
+
+    def reset(self, *, seed, options=None):
+        SEEDS.append(seed)
+        self.state = (options or {"macrostate": (1, 2, 0)})["macrostate"]
+        self.poses = np.array([[0.0, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0]])
+        return None, {"macrostate": np.array(self.state), "fault": False}
+
+    def step(self, action):
+        what, mine_mm, others_mm, turned_deg = SCRIPT.get(self.count, ("", NOTHING, NOTHING, 0))
+        self.count += 1
+        if what != "slips":
+            self.state = two_cubes(0).rules.turned(self.state, action)
+        if self.real:
+            cube = action // 2
+            self.poses[[cube, 1 - cube], :3] += 1e-3 * np.array([mine_mm, others_mm])
+            self.poses[cube, [3, 6]] = np.cos(np.radians(turned_deg) / 2), np.sin(np.radians(turned_deg) / 2)
+        fault = self.real and what == "dropped"
+        return None, 0.0, False, False, {"macrostate": np.array(self.state), "fault": fault, "fault_reason": what}
+
+    def object_poses(self):
+        return self.poses.copy()
+
+    def motion(self):
+        return SimpleNamespace(body_names=("cube_1", "cube_0"), poses_in_world=self.poses[None, ::-1])
+
+
+gymnasium.register("scripted/TwoCubes-v0", Scripted)
+
+
+def two_cubes(slip):
+    """The task of the scripted scene; nothing is forbidden."""
+    spec = registry.task(f"arrows:cubes=2,forbid=none,slip={slip}")
+    targets = replace(spec.targets, as_ruled_varied=0.5, error_mm=6.0)
+    return replace(spec, env_id="scripted/TwoCubes-v0", targets=targets)
+
+
+def test_figures_of_fidelity_have_their_units_and_targets():
+    """An object that is lifted counts as none that stands, and a yaw to the nearest quarter turn."""
+    spec = two_cubes(0.5)
+    for level, world, required, met in (("clean", "", "99.9%", False), ("mild", " at mild", "50.0%", True)):
+        SEEDS.clear()
+        figures = fidelity_figures(spec, 4, level)
+        found = [(each.what, each.required, each.measured, each.met) for each in figures]
+        assert [(what.removeprefix(f"{spec.id}{world}: "), *values) for what, *values in found] == [
+            ("macro-actions exactly as the rules say, of 4", f">= {required}", "75.00%", met),
+            ("other objects moved, worst, mm", "< 1", "0.500", True),
+            ("position error, p99, mm", "< 6", "4.95", True),
+            ("yaw error, p99, degrees", "< 1", "1.98", False),
+            ("macro-actions that slip, of 3", "0.0% to 100.0%", "33.3%", True),
+            ("objects that slip move, worst, mm", "< 5", "2.00", True),
+        ]
+        assert len(set(SEEDS)) == 3, "one to measure heights, one at first, and one after the fault"
+    (figure,) = fidelity_figures(replace(two_cubes(0), targets=None), 3, level)
+    assert (figure.required, figure.measured, figure.met) == ("–", "66.67%", True)
+
+
+def test_a_walk_ends_with_its_first_fault_and_drifts_as_far_as_a_standing_object():
+    """Each walk and each trial has a start of its own."""
+    SEEDS.clear()
+    found = physics.walk(two_cubes(0), "true")
+    assert found.pop("drift_mm") == pytest.approx(5.0)
+    assert found == {
+        "sense": "true", "actions": 803, "as_ruled": 802, "lengths": [3, 200, 200, 200, 200], "faults": ["dropped"],
+    }  # fmt: skip
+    assert len(set(SEEDS)) == len(SEEDS) == 5
+    assert physics.as_ruled(two_cubes(0), physics.PhysicsSettings(), 5) == 4 and len(set(SEEDS)) == 10
 
 
 @pytest.mark.parametrize("name", physics.SWEEPS)
@@ -124,11 +193,6 @@ def test_random_episodes_add_up_over_blocks_and_calls(monkeypatch, tmp_path):
         counted.append((kept["clean"]["random_episodes"], kept["clean"]["random_solved"]))
         assert kept["mild"] == none
     assert counted == [(5, 3), (8, 4), (11, 5), (11, 5)]
-
-
-def test_a_task_without_targets_is_only_measured():
-    (figure,) = fidelity_figures(registry.task("arrow_puzzle_hard"), 2)
-    assert (figure.required, figure.measured, figure.met) == ("–", "100.00%", True)
 
 
 def test_a_rate_is_judged_by_its_binomial_interval():

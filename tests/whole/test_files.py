@@ -39,7 +39,8 @@ def test_recording_of_continuous_control(tmp_path: Path, expected: Expected) -> 
     commands = np.zeros((3, 7), np.float32)
     commands[:, 2] = -0.1
     commands[1:, 6] = 1.0
-    with closing(made.unwrapped) as env, motion_recording(tmp_path / "motion.rrd", env) as watch:
+    expert_m = np.array([[0.6, 0.0, 0.2], [0.5, 0.0, 0.2]])
+    with closing(made.unwrapped) as env, motion_recording(tmp_path / "motion.rrd", env, expert_m=expert_m) as watch:
         replay(env, 0, commands, watch)
     text = as_text(tmp_path / "motion.rrd")
     lines = text.splitlines()

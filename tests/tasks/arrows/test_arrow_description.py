@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.rules import COUPLINGS, FORBIDS, GOALS, Arrows
+from imagine_bench.tasks.continuous.instructions import instruction
 from imagine_bench.tasks.parameters.parameters import GESTURES
 from whole_outputs import KEPT
 
@@ -57,7 +58,7 @@ def test_a_canonical_name_says_its_world_and_only_it():
 
 
 def test_one_world_has_one_name(expected):
-    """Its name, encoder, horizon, options of its environment, and macro-actions with the turns of cubes."""
+    """Its name, encoder, horizon, options of its environment, a wish, and macro-actions with the turns of cubes."""
     said = re.findall(r"^\$ (.*)$", (KEPT / "worlds_by_name.txt").read_text(), re.MULTILINE)
     answers = []
     for each in said:
@@ -68,6 +69,7 @@ def test_one_world_has_one_name(expected):
         assert each != spec.id or gymnasium.spec(spec.env_id).kwargs == dict(entry.options)
         options = dict(registry.task_entry(spec.id).options)
         answers += [f"$ {each}", f"{spec.id}  {spec.encoder}  {spec.horizon}  {entry.env_id}  {options}"]
+        answers.append(f"  {instruction(spec, spec.rules.start_states[0])}")
         turns = spec.rules.world.turns if spec.id.startswith("arrow") else [()] * spec.n_actions
         for name, cubes in zip(spec.action_names, turns, strict=True):
             signs = [f"{turn.cube}{'+' if turn.clockwise else '-'}" for turn in cubes]
@@ -86,13 +88,6 @@ def test_a_world_may_lie_in_a_file(tmp_path):
     file.write_text('{"slip": 0.1, "cubes": 4, "slip": 0.3}')
     with pytest.raises(ArtefactError, match="one of slip, cubes, slip is given twice"):
         registry.task(f"arrows:@{file}")
-
-
-def test_a_world_ends_at_its_own_horizon():
-    for options, horizon in (({"horizon": 3}, 3), ({"cubes": 1}, registry.task("arrows:cubes=1").horizon)):
-        env = gymnasium.make("imagine_bench/Arrows-v0", goal="toward_agent", execution="kinematic", **options)
-        assert env.get_wrapper_attr("_max_episode_steps") == horizon
-        env.close()
 
 
 @pytest.mark.parametrize("kind", ["", "-vector"])

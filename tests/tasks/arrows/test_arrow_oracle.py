@@ -10,6 +10,7 @@ import pytest
 from imagine_bench import registry
 
 WORLDS = [
+    "arrow_puzzle",
     "arrow_puzzle_hard",
     "arrow_puzzle_clockwise",
     "arrow_puzzle_easy",

@@ -9,11 +9,8 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from imagine_bench.tasks.continuous.controls import WORKSPACE_HIGH_M
-from imagine_bench.tasks.continuous.spec import make_arrows
-
-from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import PhysicsSettings
+from imagine_bench.tasks.continuous.controls import WORKSPACE_HIGH_M, WORKSPACE_LOW_M
+from imagine_bench.tasks.continuous.spec import make_arrows, make_pick_place
 
 IDS = sorted(each for each in gymnasium.registry if re.fullmatch(r"imagine_bench/\w+Motion-v0", each))
 
@@ -30,14 +27,6 @@ def test_checkers_of_gymnasium_and_stable_baselines_are_content(env_id: str) -> 
     env.close()
 
 
-@pytest.mark.parametrize(("name", "value"), [("plan_error_mm", 5.0), ("plan_error_deg", 5.0), ("sense", "nominal")])
-def test_physics_of_a_planner_is_refused(name: str, value: float | str) -> None:
-    """It would change nothing: a command is carried out as it is."""
-    with pytest.raises(InvalidValueError, match=f"Physics setting {name} is of the planner of macro-actions"):
-        make_arrows(physics={name: value})
-    make_arrows(physics={name: getattr(PhysicsSettings, name), "pad_friction": 0.5}, observation="proprio").close()
-
-
 @pytest.mark.parametrize(("rate_hz", "images"), [(25, 25), (125, 125), (62.5, 62), (12.5, 12), (5, 5)])
 def test_videos_have_as_many_images_a_second_as_commands(rate_hz: float, images: int) -> None:
     """Of single environments and of lanes, for what records or plays images in simulated time."""
@@ -47,19 +36,12 @@ def test_videos_have_as_many_images_a_second_as_commands(rate_hz: float, images:
     assert [env.metadata["render_fps"] for env in (one, many)] == [images] * 2
 
 
-@pytest.mark.parametrize("rate_hz", [0.5, 4.9, 126, 0, float("nan")])
-def test_rates_below_5_hz_or_above_the_simulations_are_refused(rate_hz: float) -> None:
-    """So the images a second of a video are never rounded to none."""
-    with pytest.raises(InvalidValueError, match=r"^Rate .* must be a number of Hz from 5 to 125\.$"):
-        make_arrows(rate_hz=rate_hz, observation="proprio")
-
-
 @pytest.mark.parametrize(
     ("control", "action", "periods", "limit"),
     [
         ("twist", [0.0] * 7, 5, ""),
         ("joint_delta", [*[0.5] * 7, 1], 2, ""),
-        ("twist", [0, 0, 1, 0, 0, 0, 1], 12, "workspace"),
+        *(("twist", [*side, 0, 0, 0, 1], 28, "workspace") for side in 0.5 * np.array([*np.eye(3)[1:], *-np.eye(3)])),
         ("twist", [0, 0, 0, 1, 0, 0, 1], 25, "reach"),  # the hand tips over until a joint is at the end of its range
         ("pose", [0.90, 0.45, 0.45, 0, 1, 0, 0, 1], 60, "reach"),  # too far for a hand that points down there
         ("pose", [0.90, 0.45, -0.08, 0, 1, 0, 0, 1], 1, "reach"),  # further than the joints go in a period
@@ -78,8 +60,16 @@ def test_a_command_that_meets_a_limit_is_clipped_and_names_it(
     joints_rad = env.servo_targets()[:7]
     assert (joints_rad == joints_rad.clip(*env.model.jnt_range[:7].T)).all()
     if limit == "workspace":
+        axis = int(np.flatnonzero(action[:3])[0])
+        side_m = (WORKSPACE_HIGH_M if action[axis] > 0 else WORKSPACE_LOW_M)[axis]
         assert limits[0] == ""
-        assert env.hand_target_m()[2] == pytest.approx(WORKSPACE_HIGH_M[2], abs=2e-3)
+        assert env.hand_target_m()[axis] == pytest.approx(side_m, abs=2e-3)
+
+
+def test_an_episode_lasts_three_seconds_for_each_macro_action() -> None:
+    usual = {"observation": "proprio", "physics": {"plan_error_mm": 0.0, "sense": "true"}}
+    envs = make_arrows(horizon=4, **usual), make_pick_place(**usual)
+    assert [env.time_limit_s for env in envs] == [12.0, 150.0]
 
 
 @pytest.mark.parametrize("control", ["joint_delta", "joint"])

@@ -55,10 +55,12 @@ def tried(env: MotionEnv, start: State, trick: Trick) -> Hand:
     for event in hand.events:
         after = tuple(event["macrostate"].tolist())
         if event["fault"]:
-            assert (event["macro_action"], event["reward"], event["terminated"]) == (-1, FAULT_REWARD, True)
+            found = (event["macro_action"], event["reward"], event["terminated"], event["legal"])
+            assert found == (-1, FAULT_REWARD, True, False)
         else:
             outcomes = env.task.rules.outcomes(before, int(event["macro_action"]))
-            assert (after, event["reward"]) in [(each.macrostate, each.reward) for each in outcomes]
+            known = [(each.macrostate, each.reward, each.success or not each.terminated) for each in outcomes]
+            assert (after, event["reward"], event["legal"]) in known
         before = after
     assert env.episode.macrostate == before
     return hand
@@ -258,6 +260,16 @@ def test_an_event_is_a_macro_action_or_says_what_else_it_is(
     assert event.fault == fault
     assert event.outcome.terminated == (fault is not None)
     assert event.outcome.macrostate == START
+
+
+def test_people_answer_an_event_as_often_as_the_rules_say() -> None:
+    """Half of them want the same as before, and a quarter each of the two other cubes."""
+    env = arrows(goal="000", forbid="none", goal_change=0.5)
+    env.reset(seed=0, options={"macrostate": START})
+    rng = np.random.default_rng(0)
+    events = [env.referee.event((0, *START[1:]), rng) for _ in range(400)]
+    wishes = [each.outcome.macrostate[-1] for each in events if each is not None]
+    assert np.bincount(wishes) == pytest.approx([200, 100, 100], abs=30)
 
 
 @pytest.mark.parametrize(

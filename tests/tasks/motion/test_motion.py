@@ -3,6 +3,7 @@
 import math
 import os
 import shutil
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -92,6 +93,7 @@ def test_very_skew_cubes_are_squared(world, skew_deg, clockwise):
 
 
 def test_two_motions_of_one_macro_action_have_one_clock(world):
+    """The first fault is theirs, and the larger error."""
     place(world)
     world.executor.capture_motion_hz = 10.0
     first, second = (world.executor.turn(cube=cube, clockwise=True) for cube in (0, 1))
@@ -101,6 +103,9 @@ def test_two_motions_of_one_macro_action_have_one_clock(world):
     assert both.motion.time_s[0] == 0.0 and both.motion.time_s[-1] == pytest.approx(both.sim_time_s)
     assert (np.diff(both.motion.time_s) >= 0.0).all()
     assert len(both.motion.time_s) == len(both.motion.qpos) == len(first.motion.qpos) + len(second.motion.qpos)
+    broken = replace(second, fault="late", ik_error_m=0.0)
+    late, early = first.then(broken), replace(first, fault="early").then(broken)
+    assert (late.fault, early.fault, late.ik_error_m) == ("late", "early", first.ik_error_m)
 
 
 def turned(change):

@@ -110,20 +110,19 @@ def test_gymnasiums_checker_passes() -> None:
     check_env(CloneExecutedEnv(clone=ScriptedClone()), skip_render_check=True)
 
 
-def test_another_execution_or_macro_action_is_refused() -> None:
-    with pytest.raises(InvalidValueError, match="in physics"):
-        CloneExecutedEnv(execution="kinematic")
+def test_another_execution_reward_or_macro_action_is_refused() -> None:
+    """A dense reward would be that of the period of its event alone."""
+    for option, why in (
+        ("execution", "in physics; execution='dense'"),
+        ("reward", "as the rules say; leave out reward"),
+    ):
+        with pytest.raises(InvalidValueError, match=why):
+            CloneExecutedEnv(**{option: "dense"})
     for action in (6, 1.5, None):
         with pytest.raises(InvalidValueError, match="from 0 to 5"):
             environment().step(action)
     with pytest.raises(InvalidValueError, match=r"call reset\(\) first"):
         CloneExecutedEnv(clone=environment().clone).step(0)
-
-
-def test_a_macro_action_has_no_dense_reward() -> None:
-    """It would be that of the period of its event alone."""
-    with pytest.raises(InvalidValueError, match="rewarded as the rules say; leave out reward"):
-        CloneExecutedEnv(reward="dense")
 
 
 def test_another_horizon_than_that_of_the_task_is_refused() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 from collections import Counter
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, cast
 from unittest import mock
@@ -13,13 +13,15 @@ from unittest import mock
 import numpy as np
 import pytest
 import torch
-from imagine_bench.tasks.scenes.constants import TABLE_HEIGHT_M
+from imagine_bench.tasks.motion.arm_model import ArmModel
+from imagine_bench.tasks.scenes.constants import OBSERVATION_QPOS_RAD, TABLE_HEIGHT_M
 from imagine_bench_motion import trials
 from imagine_bench_motion.cloning import Clone, Standardisation, Training, _varied, train
 from imagine_bench_motion.demonstrations import DemonstrationData, collect, turn_of
 from imagine_bench_motion.instruction import GO_BACK, words_vector
 from imagine_bench_motion.network import ChunkPolicy, PointEncoder, PolicyLayout, new_network
-from imagine_bench_motion.trials import MOST_PERIODS, share_done, tries
+from imagine_bench_motion.skills import begin, skill_env
+from imagine_bench_motion.trials import MOST_PERIODS, Try, share_done, summary, tries
 from numpy.typing import NDArray
 from scripted_clone import ScriptedClone
 
@@ -55,6 +57,8 @@ def test_demonstrations_ask_for_the_turns_and_after_each_to_go_back() -> None:
     data = demonstrations()
     names = task("arrow_puzzle").action_names
     joints_rad = data.numbers[:, -16:-9]
+    hand_m = [ArmModel().tcp_in_base(command[:7])[0] for command in data.commands[::25]]
+    np.testing.assert_allclose(data.hand_m[::25], hand_m, atol=1e-6, err_msg="the commands kept are the expert's own")
     for episode in range(data.count):
         rows = data.episode == episode
         words = data.instructions[rows].tolist()
@@ -134,11 +138,21 @@ def test_images_are_moved_as_far_as_is_said() -> None:
     assert len(set(places)) > 10
 
 
+class Brightness(torch.nn.Sequential):
+    """Heat maps that mark what is bright."""
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        return 100.0 * torch.nn.functional.avg_pool2d(images.mean(1, keepdim=True), 4).expand(-1, 2, -1, -1)
+
+
 def test_a_point_moves_with_the_thing_that_it_marks() -> None:
-    """By one cell of the heat map for four pixels, whatever the weights; the instruction alone says where to look."""
-    generator = torch.Generator().manual_seed(0)
+    """By one cell of the heat map for four pixels, whatever the weights; the instruction alone says where to look.
+
+    A place does not move with an image that was moved, as far as is told.
+    """
     layout = PolicyLayout(cameras=("front",), numbers=1, commands=1, heat_maps=2)
-    encoder = cast(PointEncoder, new_network(layout, 64, generator).encoders["front"])
+    network = new_network(layout, 64, torch.Generator().manual_seed(0))
+    encoder = cast(PointEncoder, network.encoders["front"])
     images = torch.full((1, 3, 64, 64), 0.4)
     moved = images.clone()
     images[:, :, 20:30, 20:30] = 1.0
@@ -147,8 +161,45 @@ def test_a_point_moves_with_the_thing_that_it_marks() -> None:
         torch.testing.assert_close(encoder.what(images)[..., 3:12, 3:11], encoder.what(moved)[..., 3:12, 4:12])
         words = torch.from_numpy(np.stack([words_vector("left"), words_vector("right")]))
         left, right = encoder(images.expand(2, -1, -1, -1), words)
+        encoder.what = Brightness()
+        encoder.where.weight.zero_()
+        encoder.where.bias.zero_()
+        places = [
+            network.look({"front": each}, words[:1], torch.tensor([px, 0.0]) * 2 / 60)
+            for each, px in ((images, 0.0), (moved, 4.0), (moved, 0.0))
+        ]
     assert not torch.equal(left, right)
     assert left.abs().max() <= 1.0
+    torch.testing.assert_close(places[1], places[0])
+    assert not torch.allclose(places[2], places[0])
+
+
+@pytest.mark.parametrize("family", ["arrows", "pick_place"])
+def test_a_skill_begins_where_its_macro_action_moves_an_object(family: str) -> None:
+    """What is held at the start is held when the arm has gone off its observation pose."""
+    env = skill_env("proprio", family=family)
+    rng = np.random.default_rng(0)
+    for macro_action in [*range(env.task.n_actions)] * 2:
+        begin(env, macro_action, rng)
+        state = env.episode.macrostate
+        outcomes = env.task.rules.outcomes(state, macro_action)
+        assert any(each.macrostate[:-1] != state[:-1] for each in outcomes)
+        assert (env.episode.events, env.world.read().macrostate) == (0, state)
+        off_rad = np.abs(env.servo_targets()[:7] - OBSERVATION_QPOS_RAD)
+        assert 0.02 < off_rad.max() <= 0.08
+
+
+def test_tries_are_counted_by_appearance_and_macro_action() -> None:
+    done = Try(macro_action=1, appearance="clean", done=True, periods=10, fault="")
+    failed = replace(done, appearance="mild", done=False, periods=76, fault="no event")
+    assert summary([done, failed, done]) == {
+        "count": 3,
+        "done": 2,
+        "mean_periods": 32.0,
+        "by_appearance": {"clean": (2, 2), "mild": (0, 1)},
+        "by_macro_action": {"1": (2, 3)},
+        "failed": [asdict(failed)],
+    }
 
 
 def test_swapped_images_are_those_of_another_start() -> None:

@@ -80,6 +80,14 @@ def test_a_noisy_expert_fails_plans_again_and_still_succeeds(monkeypatch: pytest
     assert not np.array_equal(told["actions"], episode("expert", 1)["actions"][: len(told["actions"])])
 
 
+def test_random_commands_are_held_and_a_mixed_set_has_each_policy_in_turn() -> None:
+    held = episode("random", 2)["actions"]
+    begun = held[::10]
+    assert np.array_equal(held, begun.repeat(10, axis=0)[: len(held)]) and len(np.unique(begun, axis=0)) == len(begun)
+    for index, policy in ((0, "expert"), (2, "random")):
+        assert np.array_equal(episode("mixed", index)["actions"], episode(policy, index)["actions"])
+
+
 @pytest.mark.parametrize("format", FORMATS)
 def test_each_format_gives_the_episode_back(tmp_path: Path, format: str) -> None:
     kept = written(tmp_path / "set", format)
