@@ -126,6 +126,15 @@ def test_a_macro_action_has_no_dense_reward() -> None:
         CloneExecutedEnv(reward="dense")
 
 
+@pytest.mark.parametrize(
+    "option", [{"told": True}, {"family": "pick_place"}, {"control": "twist"}, {"observation": "human"}]
+)
+def test_options_that_the_clone_decides_are_refused(option: dict[str, str | bool]) -> None:
+    """With ``told`` no frame shows the goal, and an agent of macro-actions is told no words."""
+    with pytest.raises(InvalidValueError, match=f"frames show the goal; leave out {next(iter(option))}"):
+        CloneExecutedEnv(**option)
+
+
 def test_another_horizon_than_that_of_the_task_is_refused() -> None:
     """Gymnasium would go on ending episodes after ten macro-actions."""
     env_id = task("arrow_puzzle_cloned").env_id
