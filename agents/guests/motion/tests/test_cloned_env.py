@@ -19,6 +19,7 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.judge.causes import Attribution, lived_again
 from imagine_bench.registry import task, task_entry
 from imagine_bench.rules import states_of
+from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.store.results import PolicyTable
 
 START = (1, 2, 3, 0)
@@ -141,6 +142,13 @@ def test_another_horizon_than_that_of_the_task_is_refused() -> None:
     env = gymnasium.make(env_id, horizon=3, disable_env_checker=True)
     with pytest.raises(InvalidValueError, match="ends after 10 macro-actions, so leave out horizon=3"):
         env.reset(seed=0)
+
+
+def test_a_dataset_of_cloned_macro_actions_names_the_task_that_tells_no_motion() -> None:
+    cloned = task("arrow_puzzle_cloned")
+    how = {"execution": "physics", "appearance": "clean", "motion_hz": 25.0}
+    with pytest.raises(InvalidValueError, match=r"^Task arrow_puzzle_cloned tells no motion of its arm; leave --motion"):
+        collect(cloned, policy_of("oracle", cloned, 0), episodes=1, seed=0, **how)
 
 
 def test_the_bench_knows_the_task_with_the_rules_of_the_arrow_puzzle() -> None:
