@@ -101,17 +101,7 @@ class Judgement:
             model_entry(name)
         object.__setattr__(self, "task", registry.task_name(self.task))  # a file of options may change
         object.__setattr__(self, "appearance", appearance_name(self.appearance))
-        spec = registry.task(self.task)
-        if _EXECUTION not in spec.executions:
-            raise InvalidValueError(
-                f"The data of a judgement are collected in the {_EXECUTION} execution, which task {self.task!r} has "
-                "not. Judge another task."
-            )
-        if spec.sight is not None:
-            raise InvalidValueError(
-                f"Frames of task {self.task!r} hide or delay a part of the macrostate, and the exact answers are about "
-                "all of it. Judge a task without the parameters gesture and lag."
-            )
+        _require_judged(registry.task(self.task))
         if self.encoder_file is not None:
             gives = encoders.kind(self.encoder_file)
             if gives not in {model_entry(name).encoder_kind for name in self.models}:
@@ -143,6 +133,20 @@ class Judgement:
             same.append(encoders.identity(self.encoder_file))
         same += filter(None, [registry.package_code(registry.task_entry(self.task).spec)])  # its code may change
         return f"{file_name(self.task)}-{self.appearance}-{digest(same)[:8]}"
+
+
+def _require_judged(spec: TaskSpec) -> None:
+    """Raise InvalidValueError for a task in which no model can be judged."""
+    if _EXECUTION not in spec.executions:
+        raise InvalidValueError(
+            f"The data of a judgement are collected in the {_EXECUTION} execution, which task {spec.id!r} has not. "
+            "Judge another task."
+        )
+    if spec.sight is not None:
+        raise InvalidValueError(
+            f"Frames of task {spec.id!r} hide or delay a part of the macrostate, and the exact answers are about all "
+            "of it. Judge a task without the parameters gesture and lag."
+        )
 
 
 class ModelFit(NamedTuple):
