@@ -355,11 +355,13 @@ def test_demonstrations_are_recorded_anew_each_time_they_are_viewed(
 
     monkeypatch.setattr(tools, "read_demonstrations", lambda folder: collected[-1])
     monkeypatch.setattr(tools, "demonstrations", lambda: SimpleNamespace(record=record))
-    monkeypatch.setattr(stream, "open_in_viewer", lambda file: opened.append((file.name, file.read_text())))
-    for content in ("old", "new"):
+    monkeypatch.setattr(stream, "open_in_viewer", lambda file: opened.append((file, file.read_text())))
+    monkeypatch.chdir(tmp_path / "mine")
+    for content, folder in (("old", tmp_path / "mine"), ("new", "."), ("newest", "../mine/")):
         collected.append(content)
-        assert main(["view", str(tmp_path / "mine"), "--episode", "2"]) == 0
-    assert opened == [("mine-episode_2.rrd", f"{content}, episode 2") for content in ("old", "new")]
+        assert main(["view", str(folder), "--episode", "2"]) == 0
+    assert [text for _, text in opened] == [f"{content}, episode 2" for content in ("old", "new", "newest")]
+    assert {file.resolve() for file, _ in opened} == {tmp_path / "mine-episode_2.rrd"}, "beside the folder"
 
 
 def test_a_terminal_is_sent_no_control_character_but_line_ends() -> None:

@@ -4,6 +4,7 @@ machine.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -192,7 +193,8 @@ class ViewCommand(OfBench):
         path, task = self.meant()
         if path is not None and (path / CARD).exists():
             index = self.episode or 0
-            file = path.with_name(f"{path.name}-episode_{index}.rrd")
+            whole = Path(os.path.abspath(path))  # "." has no name of its own
+            file = whole.with_name(f"{whole.name}-episode_{index}.rrd")
             demonstrations().record(read_demonstrations(path), index, file)
             path = file
         else:

@@ -85,7 +85,11 @@ def _success(tables: RuleTables, horizon: int) -> float:
 
 
 def _as_measured(tables: RuleTables, found: dict[str, Any]) -> RuleTables:
-    """A machine in which macro-actions fail as segments did, and a failure ends the episode."""
+    """A machine in which macro-actions fail as segments did, and a failure ends the episode.
+
+    The share of each pair is scaled as the lower end of the interval of all segments is to their share. No pair has
+    more than this lower end.
+    """
     tries = sum(each[2] for each in found["segments"])
     as_ruled = sum(each[3] for each in found["segments"])
     low, _ = wilson(as_ruled, tries)
@@ -98,7 +102,7 @@ def _as_measured(tables: RuleTables, found: dict[str, Any]) -> RuleTables:
             [works.get((state[:-1], action), unmeasured) for state in tables.index]
             for action in range(len(tables.reward))
         ]
-    ).clip(0.0, 1.0)
+    ).clip(0.0, low)
     alive = tables.alive.multiply(share.ravel()[:, None]).tocsr()
     return replace(tables, alive=alive, success=share * tables.success)
 

@@ -66,6 +66,7 @@ from imagine_bench.values import Json
 SIZES = (100, 300, 1_000, 3_000, 10_000)
 SAMPLES = 8
 _FORMAT = 5  # 4 asked no pairs that differ in the light alone
+_EXECUTION = "kinematic"  # of the data
 _AFTER = 6  # transitions after the end whose images are kept
 Costs = dict[str, str | float]
 
@@ -100,11 +101,7 @@ class Judgement:
             model_entry(name)
         object.__setattr__(self, "task", registry.task_name(self.task))  # a file of options may change
         object.__setattr__(self, "appearance", appearance_name(self.appearance))
-        if registry.task(self.task).sight is not None:
-            raise InvalidValueError(
-                f"Frames of task {self.task!r} hide or delay a part of the macrostate, and the exact answers are about "
-                "all of it. Judge a task without the parameters gesture and lag."
-            )
+        _require_judged(registry.task(self.task))
         if self.encoder_file is not None:
             gives = encoders.kind(self.encoder_file)
             if gives not in {model_entry(name).encoder_kind for name in self.models}:
@@ -136,6 +133,20 @@ class Judgement:
             same.append(encoders.identity(self.encoder_file))
         same += filter(None, [registry.package_code(registry.task_entry(self.task).spec)])  # its code may change
         return f"{file_name(self.task)}-{self.appearance}-{digest(same)[:8]}"
+
+
+def _require_judged(spec: TaskSpec) -> None:
+    """Raise InvalidValueError for a task in which no model can be judged."""
+    if _EXECUTION not in spec.executions:
+        raise InvalidValueError(
+            f"The data of a judgement are collected in the {_EXECUTION} execution, which task {spec.id!r} has not. "
+            "Judge another task."
+        )
+    if spec.sight is not None:
+        raise InvalidValueError(
+            f"Frames of task {spec.id!r} hide or delay a part of the macrostate, and the exact answers are about all "
+            "of it. Judge a task without the parameters gesture and lag."
+        )
 
 
 class ModelFit(NamedTuple):
@@ -382,7 +393,7 @@ def _collected(judgement: Judgement, place: Path, seed: int) -> Dataset:
     while True:
         policy = policy_of(judgement.policy, spec, seed)
         played, apart, card = collect(
-            spec, policy, episodes=episodes, seed=seed, execution="kinematic", appearance=judgement.appearance
+            spec, policy, episodes=episodes, seed=seed, execution=_EXECUTION, appearance=judgement.appearance
         )
         if len(played.actions) >= judgement.sizes[-1]:
             return write_dataset(place, played, apart, card, "npz")

@@ -99,7 +99,7 @@ def collect(
     motion = list[ArmMotion]()
     env_id = registry.task_entry(spec.id).env_id
     with closing(gymnasium.make(env_id, execution=execution, appearance=appearance)) as env:
-        watch = _watching(env, motion_hz, motion)
+        watch = _watching(spec.id, env, motion_hz, motion)
         for index in tqdm(range(episodes), desc=f"{spec.id} {policy.name}", unit="episode", disable=None):
             options = None
             if policy.facts.get("played") == POLICIES["uniform"]:  # an agent may have that name, too
@@ -116,13 +116,13 @@ def collect(
     return played, apart, {**_card(spec, policy, played), **made, "faults": sum(part["faults"] for part in parts)}
 
 
-def _watching(env: Env, motion_hz: float, motion: list[ArmMotion]) -> Callable[[], None]:
+def _watching(task: str, env: Env, motion_hz: float, motion: list[ArmMotion]) -> Callable[[], None]:
     """The call after each macro-action: None, or one that adds the arm's motion to the samples so far."""
     scene = env.unwrapped
     if not motion_hz:
         return lambda: None
     if not isinstance(scene, ArmReader):
-        raise InvalidValueError(f"{env} has no arm whose motion can be read; leave --motion-hz out.")
+        raise InvalidValueError(f"Task {task} tells no motion of its arm; leave --motion-hz out.")
     scene.capture_motion_hz = motion_hz
     return lambda: motion.append(scene.arm_motion())
 

@@ -133,6 +133,7 @@ class PlayedRun(Wrapper):
         self._tests = self._counters.test or EvaluationCounts()
         self._training = spec.protocol.budgets[-1] if registry.agent_entry(spec.agent).learns else 0
         self._now: RecordedEnv | None = None
+        self._moves_before = 0  # of the episode that was kept last, 0 where an earlier session kept it
         self._seen: tuple[Observed, Info]
         if self._counters.rows and not self.is_done:  # killed between the last episode and the mark
             self._finish()
@@ -150,7 +151,7 @@ class PlayedRun(Wrapper):
     @property
     def moves(self) -> int:
         """Macro-actions of the episode that goes on, or of the latest."""
-        return 0 if self._now is None else len(self._now.episode.actions)
+        return self._moves_before if self._now is None else len(self._now.episode.actions)
 
     @property
     def words(self) -> str:
@@ -210,6 +211,7 @@ class PlayedRun(Wrapper):
         counters = self._counters
         played = self._now.episode
         self._now = None
+        self._moves_before = len(played.actions)
         if counters.episode < self._training:
             counters.add_episode(played.success, len(played.actions))
         else:

@@ -274,7 +274,8 @@ class MotionEnv(SceneEnv):
             InvalidValueError: As :meth:`step`; then nothing has moved.
         """
         self._require_begun()
-        actions = actions[: max(0, math.ceil(self.time_limit_s / self.period_s) - self.episode.periods)]
+        periods_left = max(0.0, self.time_limit_s / self.period_s - self.episode.periods)
+        actions = actions[: math.ceil(min(periods_left, len(actions)))]
         before = self.data.ctrl[self.columns.ctrl]
         commands = []
         limits = []

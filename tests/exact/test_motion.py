@@ -54,6 +54,17 @@ def test_what_is_shown_is_the_product_of_the_segments_lower_bounds() -> None:
     assert certificate(spec, measure).shown == pytest.approx((2 * share + share**2) / 3)
 
 
+def test_a_failure_of_one_pair_makes_no_other_pair_surer() -> None:
+    """No pair counts for more than the lower end of all segments' interval, those without a failure included."""
+    spec = registry.task("arrow_puzzle_easy")
+    measure = measurement(spec, of=100, right=100)
+    needed = {(state[:-1], spec.rules.optimal_action(state)) for state in spec.rules.start_states}
+    failing = next(each for each in measure["segments"] if (tuple(each[0]), each[1]) not in needed)
+    failing[3] = 0
+    low, _ = wilson(500, 600)
+    assert certificate(spec, measure).shown == pytest.approx((2 * low + low**2) / 3)
+
+
 def test_a_short_time_limit_shows_one_macro_action() -> None:
     spec = registry.task("arrow_puzzle_easy")
     found = certificate(spec, measurement(spec, longest_s=2.0, limit_s=3.9))

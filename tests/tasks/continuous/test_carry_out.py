@@ -86,6 +86,13 @@ def test_nothing_is_carried_out_after_the_end() -> None:
     assert env.carry_out(np.tile(still, (3, 1))) == []
 
 
+def test_actions_are_carried_out_at_once_without_a_time_limit() -> None:
+    env = make_arrows(cubes=1, control="joint", observation="proprio", time_limit_s=float("inf"))
+    env.reset(seed=541)
+    still = np.append(env.servo_targets()[:-1], 1.0).astype(np.float32)
+    assert [each.truncated for each in env.carry_out(np.tile(still, (3, 1)))] == [False] * 3
+
+
 TO_A_POSE = [0.6, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0, 1.0]
 
 

@@ -19,6 +19,7 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.judge.causes import Attribution, lived_again
 from imagine_bench.registry import task, task_entry
 from imagine_bench.rules import states_of
+from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.store.results import PolicyTable
 
 START = (1, 2, 3, 0)
@@ -125,12 +126,28 @@ def test_another_execution_reward_or_macro_action_is_refused() -> None:
         CloneExecutedEnv(clone=environment().clone).step(0)
 
 
+@pytest.mark.parametrize(
+    "option", [{"told": True}, {"family": "pick_place"}, {"control": "twist"}, {"observation": "human"}]
+)
+def test_options_that_the_clone_decides_are_refused(option: dict[str, str | bool]) -> None:
+    """With ``told`` no frame shows the goal, and an agent of macro-actions is told no words."""
+    with pytest.raises(InvalidValueError, match=f"frames show the goal; leave out {next(iter(option))}"):
+        CloneExecutedEnv(**option)
+
+
 def test_another_horizon_than_that_of_the_task_is_refused() -> None:
     """Gymnasium would go on ending episodes after ten macro-actions."""
     env_id = task("arrow_puzzle_cloned").env_id
     env = gymnasium.make(env_id, horizon=3, disable_env_checker=True)
     with pytest.raises(InvalidValueError, match="ends after 10 macro-actions, so leave out horizon=3"):
         env.reset(seed=0)
+
+
+def test_a_dataset_of_cloned_macro_actions_names_the_task_that_tells_no_motion() -> None:
+    cloned = task("arrow_puzzle_cloned")
+    oracle = policy_of("oracle", cloned, 0)
+    with pytest.raises(InvalidValueError, match=r"^Task arrow_puzzle_cloned tells no motion of its arm; leave --"):
+        collect(cloned, oracle, episodes=1, seed=0, execution="physics", appearance="clean", motion_hz=25.0)
 
 
 def test_the_bench_knows_the_task_with_the_rules_of_the_arrow_puzzle() -> None:

@@ -40,6 +40,7 @@ def test_a_goal_is_reached_by_the_optimal_macro_actions_alone(task: str, start: 
         if expert.is_done:
             expert.begin(env.task.rules.optimal_action(env.episode.macrostate))
         observation, reward, terminated, truncated, info = goals.step(expert.act())
+        assert info["success"] == info["is_success"] == (reward == 0.0), "of the goal, and not of the rules"
         rewards.append(reward)
         seen.append(observation)
         over = terminated or truncated

@@ -271,6 +271,21 @@ def test_more_macro_actions_are_another_row(tmp_path: Path, monkeypatch: pytest.
     assert [each["macro_actions"] for each in json.loads(out.read_text())["rows"]] == [20, 40]
 
 
+def test_a_task_seed_and_appearance_are_one_row_however_often_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Repeated rows would count as seeds of their own."""
+    monkeypatch.setattr(commands, "_learner", lambda spec: 20.0)
+    monkeypatch.setattr(commands, "written", lambda spec, budget, seed, look, own: {"seed": seed, "macro_actions": 20})
+    out = tmp_path / "written.json"
+    for look in ("light=0.5,camera=0.2", "camera=0.2,light=0.50"):
+        words = ["programs", "write", *["arrow_puzzle_easy"] * 2, "--seeds", "1", "2", "1", "--times", "1"]
+        monkeypatch.setattr(sys, "argv", [*words, "--codes", look, "--out", str(out)])
+        commands.main()
+    found = [(each["codes"], each["seed"]) for each in json.loads(out.read_text())["rows"]]
+    assert found == [("light=0.5,camera=0.2", 1), ("light=0.5,camera=0.2", 2)]
+
+
 _HARDER = ("arrows:slip=0.2", "arrows:horizon=5,gesture=first", "arrows:horizon=6,lag=2")
 
 

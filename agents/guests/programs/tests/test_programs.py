@@ -7,6 +7,7 @@ import json
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +17,15 @@ from imagine_bench_programs.experience import macro_actions_of, play, write_expe
 from imagine_bench_programs.model import make_program
 from imagine_bench_programs.program import Program, spelled
 from imagine_bench_programs.scores import efficiency, score
+from imagine_bench_programs.symbol_rules import SymbolRules
 
 from imagine_bench import bench, registry
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ImagineBenchError, InvalidValueError
-from imagine_bench.interfaces import AgentContext
+from imagine_bench.interfaces import AgentContext, Outcome, State, TaskSpec
 from imagine_bench.protocols.control import context_of, protocol
 from imagine_bench.protocols.data import RunSpec
+from imagine_bench.rules import states_of_play
 from imagine_bench.running.isolation import Limits
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
@@ -104,6 +107,36 @@ def test_the_example_is_exact_and_misses_slips_by_their_probability(program: Pro
     assert slips.total_variation == pytest.approx(0.2, abs=1e-12)
     assert slips.ranking == pytest.approx(0.8) and slips.fidelity == pytest.approx(0.95)
     assert slips.facts == 39 and slips.found == 39 - 6 * 4, "each macro-action turns one cube, from four directions"
+
+
+class Elsewhere(SymbolRules):
+    """The rules, but with a probability of 0.8 the next symbols are others."""
+
+    def __init__(self, spec: TaskSpec, elsewhere: State) -> None:
+        super().__init__(spec.n_actions)
+        self._rules = spec.rules
+        self._elsewhere = elsewhere
+
+    def outcomes(self, macrostate: State, action: int) -> tuple[Outcome, ...]:
+        right = [replace(each, probability=0.2) for each in self._rules.outcomes(macrostate, action)]
+        return (*right, Outcome(0.8, self._elsewhere, -1.0, terminated=False, success=False))
+
+
+def test_only_macrostates_of_the_world_are_distractors() -> None:
+    """Nothing else can be drawn, however probable it is. Of 164 others, five are drawn and one is more probable."""
+    spec = registry.task("arrow_puzzle")
+    for outside in ((-1, -1, -1, -1), (0, 0, 0, 0)):
+        assert score(Elsewhere(spec, outside), spec).ranking == 1.0
+    start = spec.rules.start_states[0]
+    reached = sum(each.macrostate == start for pair in pairs_of_play(spec) for each in spec.rules.outcomes(*pair))
+    unreached = 1.0 - reached / len(pairs_of_play(spec))
+    expected = unreached * (1.0 - 5 / 164) + (1.0 - unreached)
+    assert score(Elsewhere(spec, start), spec).ranking == pytest.approx(expected, abs=1e-12)
+
+
+def pairs_of_play(spec: TaskSpec) -> list[tuple[State, int]]:
+    """Every macro-action in every macrostate in which an episode goes on."""
+    return list(itertools.product(states_of_play(spec.rules), range(spec.n_actions)))
 
 
 def test_experience_of_another_task_gives_no_efficiency(tmp_path: Path) -> None:

@@ -105,9 +105,12 @@ def play_all(one: Server, player: str) -> None:
     all_done = False
     while not all_done:
         _, answer = ask(one, "/reset", {"player": player})
+        moves = answer["metadata"]["step_count"]
         while not answer["done"]:
             action = spec.action_names[spec.rules.optimal_action(told(spec, answer))]
             _, answer = ask(one, "/step", {"player": player, "action": action})
+            moves += 1
+            assert answer["metadata"]["step_count"] == moves, "also after the last macro-action of the last test"
         all_done = answer["metadata"]["all_done"]
 
 

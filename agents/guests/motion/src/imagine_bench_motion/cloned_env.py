@@ -36,6 +36,10 @@ _AT_HOME_RAD = 2e-3
 """An arm nearer to its observation pose, at each joint, is there."""
 
 
+_DECIDED = ("control", "family", "observation", "told")
+"""Options of continuous control that macro-actions of a clone do not have."""
+
+
 class ControlPeriod(NamedTuple):
     """What a control period ends with."""
 
@@ -121,7 +125,7 @@ class CloneExecutedEnv(gymnasium.Env[Frame, np.int64]):
     Raises:
         ArtefactError: No such file.
         InvalidValueError: Another execution, a clone that does not see proprio and something more, a world whose images
-            hide something or are late, or a dense reward.
+            hide something or are late, a dense reward, or an option that the clone decides.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 - Gymnasium's own declaration
@@ -135,6 +139,11 @@ class CloneExecutedEnv(gymnasium.Env[Frame, np.int64]):
     ) -> None:
         if execution != "physics":
             raise InvalidValueError(f"A clone executes macro-actions in physics; execution={brief(execution)} is none.")
+        for name in _DECIDED:
+            if name in options:
+                raise InvalidValueError(
+                    f"The clone decides what it sees and does, and frames show the goal; leave out {name}."
+                )
         self.clone = clone if isinstance(clone, Clone) else Clone.load(Path(clone or BUNDLED))
         sees = self.clone.observation.split(",")
         if "proprio" not in sees or len(sees) < 2:  # one part alone has no name

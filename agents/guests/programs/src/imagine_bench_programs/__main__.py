@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from imagine_bench.appearance import appearance_name
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, require_integer
 from imagine_bench.exact.certificate import certificate
 from imagine_bench.interfaces import TaskSpec
@@ -118,11 +119,15 @@ def _write(given: argparse.Namespace) -> None:
     rows, done = ([], set()) if given.out is None else _kept(given.out)
     if given.own and not given.codes:
         raise InvalidValueError("--own reads images; name their appearance with --codes, such as --codes clean.")
-    kind = f"own {given.codes}" if given.own else given.codes
+    look = appearance_name(given.codes) if given.codes else ""
+    kind = f"own {look}" if given.own else look
     for spec, learner in [_budgeted(name, given.times) for name in given.tasks]:
         budget = int(given.times * learner)
-        for seed in [seed for seed in given.seeds if (spec.id, kind, seed, budget) not in done]:
-            found = written(spec, budget, seed, given.codes, own=given.own)
+        for seed in given.seeds:
+            if (spec.id, kind, seed, budget) in done:
+                continue
+            done.add((spec.id, kind, seed, budget))
+            found = written(spec, budget, seed, look, own=given.own)
             rows.append({"task": spec.id, "codes": kind, "learner": learner, **found})
             print(*(f"{value:.4g}" if isinstance(value, float) else value for value in rows[-1].values()), flush=True)
             if given.out is not None:

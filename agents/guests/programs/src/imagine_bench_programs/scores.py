@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -103,6 +103,7 @@ def score(rules: SymbolRules, spec: TaskSpec) -> Scores:
     """Compare rules with those of a task."""
     truth = machine(spec.rules)
     states = [tuple(row) for row in truth.coordinates.tolist()]
+    known = {*states}
     width = len(states[0])
     first = np.searchsorted(truth.pair, np.arange(truth.n_actions * truth.n_play + 1))
     distances, ranks, shares = [], [], []
@@ -117,7 +118,7 @@ def score(rules: SymbolRules, spec: TaskSpec) -> Scores:
         likeliest = max(imagined, key=lambda state: imagined[state])
         for state, share in real.items():
             shares.append(share * sum(a == b for a, b in zip(state, likeliest, strict=True)) / width)
-            ranks.append(share * _ranked_first(state, real, imagined, len(states)))
+            ranks.append(share * _ranked_first(state, real, imagined, known))
     graph = factor_graph(truth)
     found = sum(_entries_found(truth, graph, expected)) + sum(_conditions_found(truth, graph, rules))
     return Scores(
@@ -140,15 +141,18 @@ def _distribution(rules: SymbolRules, state: State, action: int) -> Distribution
     return added_up((each.macrostate[: len(state)], each.probability) for each in outcomes)
 
 
-def _ranked_first(state: State, real: Distribution, imagined: Distribution, states: int) -> float:
-    """Probability that a state is more probable than each of the distractors, drawn without replacement."""
+def _ranked_first(state: State, real: Distribution, imagined: Distribution, states: Collection[State]) -> float:
+    """Probability that a state is more probable than each of the distractors, drawn without replacement.
+
+    Distractors are macrostates of the world. Other symbols, such as those of an unreadable image, are none.
+    """
     own = imagined.get(state, 0.0)
     if not own:
         return 0.0
-    better = sum(share >= own and other not in real for other, share in imagined.items())
-    others = states - len(real)
+    better = sum(share >= own and other in states and other not in real for other, share in imagined.items())
+    others = len(states) - len(real)
     drawn = min(DISTRACTORS, others)
-    return math.comb(max(0, others - better), drawn) / math.comb(others, drawn)
+    return math.comb(others - better, drawn) / math.comb(others, drawn)
 
 
 def _entries_found(truth: Machine, graph: FactorGraph, expected: list[Distribution]) -> Iterator[int]:

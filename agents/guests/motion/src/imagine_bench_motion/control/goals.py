@@ -19,6 +19,8 @@ WITHIN_M = 0.02
 WITHIN_RAD = math.radians(20.0)
 """An object that is so near its goal, and turned off it by less, has reached it."""
 _PER_OBJECT = 5
+_SUCCESS = ("is_success", "success")
+"""The keys of ``info`` that say whether the goal is reached."""
 GoalObservation = dict[str, NDArray[Any]]
 
 
@@ -28,7 +30,7 @@ class GoalEnv(gymnasium.Wrapper[Observed, Any, Observed, Any]):
     Observations are a dict: ``observation``, the parts of the environment's in one vector; ``achieved_goal`` and
     ``desired_goal``, for each object x, y, z (m), and the cosine and sine of its yaw, float32 (5 N,). A goal is where
     the optimal policy leaves the objects that it moves until its success, and where the others stand. The reward is 0
-    where it is reached and -1 elsewhere. ``info["is_success"]`` says so.
+    where it is reached and -1 elsewhere. ``info["is_success"]`` and ``info["success"]`` say so.
 
     Args:
         env: Whose observation has vectors only: parts of ``proprio``, ``objects`` and ``state``.
@@ -70,14 +72,14 @@ class GoalEnv(gymnasium.Wrapper[Observed, Any, Observed, Any]):
         self._carry_out_plan(self._motion.episode.macrostate)
         self._goal = _goal_of(self._planned.object_poses())
         observation = self._observation(seen)
-        return observation, {**info, "is_success": self._reached(observation) == 0.0}
+        return observation, {**info, **dict.fromkeys(_SUCCESS, self._reached(observation) == 0.0)}
 
     def step(self, action: Any) -> tuple[Observed, float, bool, bool, Info]:
         """Carry out a command."""
         seen, _, terminated, truncated, info = self.env.step(action)
         observation = self._observation(seen)
         reward = self._reached(observation)
-        return observation, reward, terminated, truncated, {**info, "is_success": reward == 0.0}
+        return observation, reward, terminated, truncated, {**info, **dict.fromkeys(_SUCCESS, reward == 0.0)}
 
     def compute_reward(self, achieved_goal: Floats, desired_goal: Floats, info: object) -> Floats:
         """0 where each object is at its goal, -1 elsewhere; goals (..., 5 N) give rewards (...)."""
