@@ -25,6 +25,7 @@ from imagine_bench.recording.filmstrips import (
     WRONG,
     Tile,
     changes,
+    rgb,
     sampled_filmstrips,
 )
 from imagine_bench.report import bench_page
@@ -72,13 +73,27 @@ def test_the_values_of_rollouts_are_not_clipped() -> None:
     assert ends[0] + 30 < ends[1] < many.shape[0] - 4, "more lines, and nothing at the edge"
 
 
-def test_a_strip_marks_cut_error_and_end() -> None:
-    names = tuple(f"turn cube {index}" for index in range(6))
-    cut, whole = (filmstrips.filmstrip(compared_rollout(np.random.default_rng(0), cut=cut), names) for cut in (3, None))
-    assert cut.shape == whole.shape
-    assert (cut == filmstrips.CUT).all(axis=2).sum() > 500  # the line
-    assert not (whole == filmstrips.CUT).all(axis=2).any()
-    assert all((whole == color).all(axis=2).sum() > 500 for color in (RIGHT, WRONG)), "borders in both colors"
+def test_a_strip_says_each_prediction_beside_the_truth() -> None:
+    """The third macro-action is imagined wrongly, the filter cuts the fourth, after which the episode is over."""
+    compared = compared_rollout(np.random.default_rng(0))
+    rollout = compared.rollout
+    verdicts = ["as the rules say", "as the rules say", "not as the rules say", "as the rules say", "episode over"]
+    rights, names = [True, True, False, True, None], "abcdef"
+    real, imagined = [Tile(compared.start_frame, "start")], [Tile(rgb(rollout.start_frame), "", "\npredicted\n(true)")]
+    compared = dataclasses.replace(compared, real_rewards=np.array([-1.0, 2.0, -3.0, 4.0, 0.0]))
+    for step, (reward, end, unsure) in enumerate(
+        zip(rollout.rewards, rollout.p_terminated, rollout.epistemic, strict=True)
+    ):
+        cut = step == 3
+        truth = ("-1.0", "+2.0", "-3.0", "+4.0", "+0.0")[step]
+        lines = [verdicts[step], f"reward {reward:+.1f} ({truth})", f"P(end) {end:.2f}", f"epistemic {unsure:.2g}"]
+        words = "\n".join([*lines, "filter cuts here" if cut else ""])
+        above = f"{step + 1}. {names[rollout.actions[step]]}"
+        real.append(Tile(compared.real_frames[step], above, pale=step == 4, cut=cut))
+        imagined.append(Tile(rgb(rollout.frames[step]), "", words, rights[step], pale=step > 2, cut=cut))
+    strip = filmstrips.filmstrip(compared, tuple(names))
+    np.testing.assert_array_equal(strip, filmstrips.sheet([("real", real), ("imagined", imagined)]))
+    assert (strip == filmstrips.CUT).all(axis=2).sum() > 500, "the line"
 
 
 def test_real_frames_are_shown_unaltered_and_upright() -> None:
@@ -141,11 +156,6 @@ def test_the_rewards_of_an_episode_are_shown_with_their_fractions() -> None:
     assert [filmstrips.signed(reward) for reward in (-1.5, -0.5, 50.0, 0.0, -1.234)] == [
         *("-1.5", "-0.5", "+50", "+0", "-1.23")
     ]
-    strips = []
-    for reward in (-1.5, -2.0):
-        episode = dataclasses.replace(recorded(1, success=False), rewards=np.array([reward]))
-        strips.append(filmstrips.episode_strip(episode, PICK_PLACE.action_names))
-    assert (strips[0] != strips[1]).any()
 
 
 def numbered(actions: list[int]) -> list[Tile]:
@@ -154,11 +164,14 @@ def numbered(actions: list[int]) -> list[Tile]:
     return [Tile(None, above) for above in ("start", *words)]
 
 
-def test_the_macro_actions_of_an_episode_are_numbered_from_one() -> None:
-    strip = filmstrips.episode_strip(recorded(3, success=True), PICK_PLACE.action_names)
-    expected = filmstrips.sheet([("", numbered([0, 1, 2]))])
-    top = TITLE_PX - 4  # where the border begins
-    np.testing.assert_array_equal(strip[:top], expected[:top])
+def test_the_macro_actions_of_an_episode_are_numbered_from_one_and_have_their_rewards() -> None:
+    episode = dataclasses.replace(recorded(3, success=True), rewards=np.array([-1.5, -0.5, 50.0]))
+    below = ["", "reward -1.5", "reward -0.5", "reward +50\nsolved"]
+    tiles = zip(numbered([0, 1, 2]), episode.frames, below, strict=True)
+    expected = [tile._replace(frame=frame, below=words) for tile, frame, words in tiles]
+    expected[-1] = expected[-1]._replace(right=True)
+    strip = filmstrips.episode_strip(episode, PICK_PLACE.action_names)
+    np.testing.assert_array_equal(strip, filmstrips.sheet([("real frames", expected)]))
 
 
 def test_the_macro_actions_of_an_overrated_policy_are_numbered_from_one() -> None:
@@ -201,6 +214,13 @@ def test_impossible_steps_are_marked_unless_frames_hide_something() -> None:
     hidden: TaskSpec = dataclasses.replace(PICK_PLACE, sight=registry.task("pick_place:gesture=first").sight)
     right = rollout(START, ASKS_RIGHT, IMPOSSIBLE)  # right at first, then a step that is impossible
     wrong = rollout(START, IMPOSSIBLE, ASKS_RIGHT)
-    assert colored(sampled_filmstrips((right,), PICK_PLACE)) == [True, True]
+    ends = dataclasses.replace(right.rollout, p_terminated=np.array([0.4, 0.6], dtype=np.float32))
+    told = [
+        Tile(right.start_frame),
+        Tile(rgb(ends.frames[0]), PICK_PLACE.action_names[0], "left object\npicked, gesture\nright", right=True),
+        Tile(rgb(ends.frames[1]), PICK_PLACE.action_names[0], "middle object\npicked; the end", right=False),
+    ]
+    shown = sampled_filmstrips((dataclasses.replace(right, rollout=ends),), PICK_PLACE)
+    np.testing.assert_array_equal(shown, filmstrips.sheet([("the real start", told)]))
     assert colored(sampled_filmstrips((wrong,), PICK_PLACE)) == [False, True]
     assert colored(sampled_filmstrips((right, wrong), hidden)) == [False, False]
