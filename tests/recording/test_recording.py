@@ -80,7 +80,7 @@ class _SeesAndExplores(FakeAgent):
     """Has learned to see, in two steps, and says how unknown each action is."""
 
     def perceived(self) -> list[Perceived]:
-        return [Perceived(n, (2,) * n, np.full((8, 8, 3), n, dtype=np.uint8)) for n in (0, 3)]
+        return [Perceived(5 * n, (2,) * n, np.full((8, 8, 3), n, dtype=np.uint8)) for n in (0, 3)]
 
     def novelty(self, observation: Observation, rng: np.random.Generator) -> NDArray[np.float32]:
         return rng.random(6, dtype=np.float32)
@@ -90,11 +90,9 @@ def test_a_recording_shows_perception_first_and_unknown_steps(imagined: Path, tm
     path = record(_SeesAndExplores(), tmp_path / "tells.rrd", name="random")
     looked, acted = times(path, "/seen/factors", "sim_time"), times(path, "/real/reward", "sim_time")
     assert len(looked) == 2 and max(looked) < min(acted)
-    assert [words.partition("it tells apart ")[2] for words in by_step(path, "/real/text", "TextDocument:text")][
-        :2
-    ] == [
-        "nothing yet.",
-        "3 things, of 2, 2, 2 values.",
+    assert by_step(path, "/real/text", "TextDocument:text")[:2] == [
+        f"In training episode {words}."
+        for words in ("0 it tells apart nothing yet", "15 it tells apart 3 things, of 2, 2, 2 values")
     ]
     asked = {step - 1 for step in times(path, "/real/reward", "env_step")}
     assert times(path, "/real/novelty/turn_the_left_cube_clockwise", "env_step") == asked
