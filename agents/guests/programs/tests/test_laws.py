@@ -429,17 +429,17 @@ def test_the_agents_expectations_are_those_of_its_laws() -> None:
 def test_what_a_program_remembers_goes_with_the_state_until_the_episode_ends(tmp_path: Path) -> None:
     """A count of steps, whose parity says which macro-action pays in the next; the program ends after two."""
     file = tmp_path / "counts.py"
-    pays = "def outcomes(s, a, m):\n n = (m or 0) + 1\n return {((n % 2,), float(a == n % 2), n > 1, n): 1.0}\n"
+    pays = "def outcomes(s, a, m):\n n = (m or 0) + 1\n return {((1,), float(a == n % 2), n > 1, n): 1.0}\n"
     file.write_text(pays)
     counts = Program(str(file), (2,), 2)
     once = counts.follow(counts.start((0,)), 0, (1,))
     assert not counts.outcomes(counts.start((0,)), 0)[0].terminated and counts.outcomes(once, 0)[0].terminated
-    assert counts.follow(once, 0, (1,)) == counts.start((1,)), "an unexpected symbol forgets"
+    assert counts.follow(once, 0, (0,)) == counts.start((0,)), "an unexpected symbol forgets"
     agent = ProgramAgent(ByteSymbols((2,)), counts)
-    seen = [Observation(frame=np.full((64, 64, 3), value, dtype=np.uint8)) for value in (0, 1)]
+    seen = Observation(frame=np.ones((64, 64, 3), dtype=np.uint8))
     for _ in range(2):
         agent.begin_episode()
-        assert [agent.act(each, explore=False) for each in seen] == [1, 0]
+        assert [agent.act(seen, explore=False) for _ in range(3)] == [1, 0, 1]
 
 
 def test_an_agent_plans_from_its_macro_actions_of_this_episode_alone() -> None:
