@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import hashlib
-from datetime import date, timedelta
+import os
+import time
+from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
+from unittest import mock
 
 import pytest
 from board_forging import on
 from imagine_bench_board.daily import world_of_day
+from imagine_bench_board.rounds import today
 
 from imagine_bench import registry
 from imagine_bench.cli import exit_code
@@ -35,6 +39,11 @@ def test_a_secret_hides_the_world_and_the_digest_binds_it() -> None:
 def test_today_is_the_day_by_default() -> None:
     with on(date(2026, 12, 3)):
         assert world_of_day() == world_of_day("2026-12-03")
+    for zone in ("X+14", "X-14", ""):  # it is another day there, for some hours of each
+        with mock.patch.dict(os.environ, TZ=zone):
+            time.tzset()
+            assert today() == datetime.now(UTC).date()
+    time.tzset()
 
 
 @pytest.mark.slow
