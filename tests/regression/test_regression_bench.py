@@ -17,7 +17,7 @@ import pytest
 from imagine_bench_regression import settings as regressor_settings
 from imagine_bench_regression import toy_regression
 from imagine_bench_regression.sections import change, choices, claim, figure_4_1, squared_error_terms, workspace
-from recordings import contents, times
+from recordings import contents
 
 from imagine_bench.cli import exit_code as main
 from imagine_bench.cli.observers import observers_of
@@ -65,13 +65,6 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> RegressionRun:
     return run(TOY, tmp_path_factory.mktemp("toy"), silent)
 
 
-def test_the_time_of_networks_that_train_together_is_shared(tmp_path: Path) -> None:
-    spec = tiny("toy_regression", networks=8, variants=("base",), test_points=2, recorded=False)
-    begun_s = time.process_time()
-    rows = run(spec, tmp_path, silent).rows
-    assert sum(float(row["train_cpu_s"]) + float(row["measure_cpu_s"]) for row in rows) < time.process_time() - begun_s
-
-
 def test_a_run_measures_every_network_of_every_variant(toy: RegressionRun) -> None:
     assert [(row["variant"], row["network"]) for row in toy.rows] == [
         (variant, index) for variant in VARIANTS for index in (0, 1)
@@ -80,7 +73,6 @@ def test_a_run_measures_every_network_of_every_variant(toy: RegressionRun) -> No
         assert all(np.isfinite(float(v)) for k, v in row.items() if k != "variant" and not k.startswith("auroc"))
         assert 0 <= float(row["coverage_0.8"]) <= 1
     assert toy.recording is not None
-    named = contents(toy.recording)
     for variant in VARIANTS:
         found = toy.evaluations[variant]
         data = toy_regression.training(variant, SeedTree(0).child("network", 0).child("data").generator())
@@ -88,9 +80,6 @@ def test_a_run_measures_every_network_of_every_variant(toy: RegressionRun) -> No
         assert found["epistemic"].shape == (2, 1000)
         assert (found["epistemic"] > 0).all()
         assert (found["stationarity"] <= np.log(5) + 1e-9).all()
-        kinds = [f"{kind}/{what}" for kind in ("epistemic", "modal", "aleatoric") for what in ("estimated", "true")]
-        for part in ("y/training", "y/prediction", *kinds):
-            assert named[f"/{variant}/{part}"] == {"x_hundredths"}, part
     with pytest.raises(ArtefactError, match="is of a regression task, in which no agent acts"):
         load_trained(toy.folder)
 
@@ -127,9 +116,12 @@ def test_interrupted_and_resumed_is_uninterrupted(agent: str, tmp_path: Path) ->
 
 def test_one_regressor_with_two_settings_in_one_bench(tmp_path: Path) -> None:
     agents = ("mc_dropout:epochs=6", "mc_dropout")
-    spec = tiny("toy_regression", agents=agents, variants=("base",), test_points=2, recorded=False)
+    spec = tiny("toy_regression", agents=agents, networks=8, variants=("base",), test_points=2, recorded=False)
+    begun_s = time.process_time()
     runs = [run(replace(spec, agent=agent), tmp_path / agent[-1], silent) for agent in agents]
     assert [each.settings["epochs"] for each in runs] == [6, 4]
+    shares = [float(row[name]) for each in runs for row in each.rows for name in ("train_cpu_s", "measure_cpu_s")]
+    assert sum(shares) < time.process_time() - begun_s, "networks that train together share the time"
 
 
 def test_networks_err_by_the_sum_of_the_causes(toy: RegressionRun, tmp_path: Path) -> None:
@@ -242,12 +234,8 @@ def test_the_command_ends_in_a_table_and_a_report(tmp_path: Path, capsys: pytest
     assert "MC dropout, 1000" in said and "3.89 (0.67)" in said
     (folder,) = (tmp_path / "robot_ik").iterdir()
     assert "Table 4.1" in (folder / "report" / "index.html").read_text()
-    recording = folder / "mc_dropout" / "seed_0" / "recording.rrd"
-    named = contents(recording)
-    for part in ("candidates", "chosen", "error_line", "error", "text"):
-        assert named[f"/choice/{part}"] >= {"sim_time", "choice"}, part
-    assert min(times(recording, "/choice/text", "choice")) == 1, "counted as its words do"
-    assert any(path.startswith("/scene") for path in named)
+    named = contents(folder / "mc_dropout" / "seed_0" / "recording.rrd")
+    assert any(path.startswith("/scene") for path in named) and named["/choice/candidates"] >= {"sim_time", "choice"}
 
 
 @pytest.mark.parametrize("name", ["minimal", "fast", "published"])
