@@ -146,7 +146,7 @@ def numbered(actions: list[int]) -> list[Tile]:
     return [Tile(None, above) for above in ("start", *words)]
 
 
-def test_the_macro_actions_of_an_episode_are_numbered_from_one_and_have_their_rewards() -> None:
+def test_the_macro_actions_of_an_episode_stand_with_their_rewards() -> None:
     episode = dataclasses.replace(recorded(3, success=True), rewards=np.array([-1.5, -0.5, 50.0]))
     below = ["", "reward -1.5", "reward -0.5", "reward +50\nsolved"]
     tiles = zip(numbered([0, 1, 2]), episode.frames, below, strict=True)

@@ -6,7 +6,6 @@ import hashlib
 import os
 import time
 from datetime import UTC, date, datetime, timedelta
-from pathlib import Path
 from unittest import mock
 
 import pytest
@@ -46,16 +45,8 @@ def test_today_is_the_day_by_default() -> None:
     time.tzset()
 
 
-@pytest.mark.slow
-def test_an_agent_is_run_on_the_world(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = f"daily --date 2026-12-01 --agents oracle random --budgets 2 --launcher this_process --out {tmp_path}"
-    assert exit_code(words.split()) == 0
-    said = capsys.readouterr().out
-    world = world_of_day("2026-12-01")
-    assert world.task in said and world.digest in said and "oracle" in said
-    assert list(tmp_path.glob("*/*/oracle/seed_0/DONE"))
-
-
-def test_options_of_runs_go_with_agents(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_says_the_world_and_takes_options_of_runs_with_agents(capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_code(["daily", "--date", DAYS[0]]) == 0
+    assert capsys.readouterr().out == f"{world_of_day(DAYS[0])}\n"
     assert exit_code("daily --date 2026-12-01 --budgets 3".split()) == 2
     assert "--budgets goes with --agents; leave it out" in capsys.readouterr().err

@@ -136,7 +136,7 @@ def test_decisions_are_carried_out_by_the_arm(monkeypatch: pytest.MonkeyPatch) -
     assert np.isnan(found["map/error"][:, outside]).all() and np.isfinite(found["map/error"][:, ~outside]).all()
 
 
-def test_a_recording_shows_the_surest_choice_and_says_by_how_many_centimetres_it_misses(tmp_path: Path) -> None:
+def test_a_recording_shows_the_surest_choice_and_by_how_much_it_misses(tmp_path: Path) -> None:
     """It misses by the line from the place reached to the place asked for. All candidates miss by more on average."""
     shape = (1, CHOICES, 3)
     rng = np.random.default_rng(10)
