@@ -91,7 +91,7 @@ class Recording:
     def show(self, **sequences: int) -> None:
         """Go on by one ``env_step``, and log how the latest macro-action moved the scene: first the scene itself.
 
-        The view looks at the middle of the small bodies, which are the objects and the fingers.
+        The view looks at the middle of the small bodies, which are the objects, the fingers and the wrist above them.
         """
         self.env_step += 1
         self.set_clocks(env_step=self.env_step, **sequences)

@@ -41,15 +41,6 @@ def test_every_format_gives_back_every_bit(tmp_path: Path, format: str) -> None:
     assert not list(tmp_path.glob(".*")), "nothing half-written is left"
 
 
-def test_nothing_a_learner_reads_holds_macrostates(tmp_path: Path) -> None:
-    for format in FORMATS:
-        written(tmp_path / format, format)
-    assert set(np.load(tmp_path / "npz/episodes.npz").files) == {field.name for field in dataclasses.fields(Episodes)}
-    assert not [name for name in pq.read_table(tmp_path / "lerobot" / _DATA).schema.names if "state" in name]
-    (data,) = (tmp_path / "minari").glob("*/data")
-    assert set(next(iter(minari.MinariDataset(data))).infos) == {"action_mask", "is_success"}
-
-
 def test_a_hash_stands_for_the_content_alone() -> None:
     episodes = collected()[0]
     for name in ("frames", "rewards", "success", "action_masks"):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -17,8 +16,7 @@ import pytest
 from bench_fakes import RulesImaginer
 from imagine_bench.tasks.arrows.rules import ArrowRules
 from numpy.typing import NDArray
-from recordings import contents
-from rerun.chunk import RrdReader
+from recordings import contents, logged
 from small_runs import Inline, context, small
 from whole_outputs import Expected, rounded
 
@@ -135,10 +133,11 @@ def test_every_plan_is_written_and_stops_with_its_episode(
 ) -> None:
     failed = next(plan for plan in wrong if not plan.solved)
     assert failed.done < failed.length and failed.compared.real_terminated[-1]
+    said = write_plans(tmp_path, [*wrong, *right], TASK, {"commit": "abc"}).replace(str(tmp_path), "HERE")
     write_plans(tmp_path, wrong, TASK, {"commit": "abc"})
     outcomes = [plan.outcome for plan in (*wrong, *right)]
     written = [(tmp_path / name).read_text() for name in ("plans.csv", "summary.json")]
-    expected("plans", "\n".join([*written, *outcomes, rounded(summarise(right))]))
+    expected("plans", "\n".join([*written, *outcomes, rounded(summarise(right)), said]))
     (tmp_path / "recording.rrd").write_text("old")
     write_plans(tmp_path, right[:1], TASK, {})
     assert sorted(path.name for path in tmp_path.iterdir()) == ["plans.csv", "plans.png", "summary.json"]
@@ -146,15 +145,9 @@ def test_every_plan_is_written_and_stops_with_its_episode(
     assert (with_faults["faults"], with_faults["steps"]) == (36, sum(plan.done for plan in right))
 
 
-def recorded(path: Path) -> tuple[Counter[str], list[str]]:
-    """Rows of each entity of a recording, and its texts."""
-    rows = Counter[str]()
-    texts = list[str]()
-    for chunk in RrdReader(path).stream():
-        rows[chunk.entity_path] += chunk.num_rows
-        if chunk.entity_path == "/real/text":
-            texts += [str(text) for (text,) in chunk.to_record_batch().column("TextDocument:text").to_pylist()]
-    return rows, texts
+def texts_of(path: Path) -> list[str]:
+    """The texts of a recording, in their order."""
+    return [text for _, (text,) in logged(path, "/real/text", "TextDocument:text", "env_step")]
 
 
 def test_the_recording_shows_the_same_plans_and_the_arm_moves(
@@ -172,19 +165,28 @@ def test_the_recording_shows_the_same_plans_and_the_arm_moves(
     path = tmp_path / "recording.rrd"
     record_plans(trained(dreamer), count=2, execution="physics", max_epistemic=None, path=path)
     timelines = contents(path)
-    rows, texts = recorded(path)
+    texts = texts_of(path)
     done = [sum(line.endswith(" done") for line in text.splitlines()) for text in texts]
     for entity in ("/real/frame", "/imagined/frame", "/imagined/filmstrip", "/real/text", "/scene/right_l3"):
         assert timelines[entity] >= {"sim_time", "env_step", "plan"}
     steps = sum(plan.done for plan in right[:2])
-    assert rows["/real/frame"] == steps + 2, "the physical arm solves the same plans"
-    assert rows["/scene/right_l3"] > 20 * steps, "the arm must be seen moving"
+    frames, poses = (
+        len(logged(path, entity, column, "env_step"))
+        for entity, column in (("/real/frame", "Image:buffer"), ("/scene/right_l3", "Transform3D:translation"))
+    )
+    assert frames == steps + 2, "the physical arm solves the same plans"
+    assert poses > 20 * steps, "the arm must be seen moving"
     assert sorted(done) == sorted(number for plan in right[:2] for number in range(plan.done + 1))
     record_plans(trained(dreamer), count=2, execution="kinematic", max_epistemic=0.05, path=path)
-    _, texts = recorded(path)
     long = [plan.number for plan in right[:2] if plan.length > 1]  # the first imagined step is certain
-    refused = {text.split()[2] for text in texts if "**Refused:**" in text}
+    refused = {text.split()[2] for text in texts_of(path) if "**Refused:**" in text}
     assert refused == {str(number) for number in long} != set() and executions == ["physics", "kinematic"]
+    dreamer.choose = lambda state: 0
+    record_plans(trained(dreamer), count=1, execution="kinematic", max_epistemic=None, path=path)
+    first, *others = (f"{step}. turn the left cube clockwise " for step in range(1, 11))
+    begun, over = (text.splitlines()[2:] for text in texts_of(path))
+    assert begun == [f"{first}**now**", *others, "", "The arm does this without looking again."]
+    assert over == [f"{first}done", *others, "", "**Failed at macro-action 1.** The shortest possible: 2."]
 
 
 @pytest.mark.parametrize(

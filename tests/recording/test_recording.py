@@ -19,8 +19,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from fake_agents import FakeAgent, FakeImaginer
 from numpy.typing import NDArray
-from recordings import contents, rerun, times, view_names
-from rerun.chunk import RrdReader
+from recordings import contents, logged, rerun, times, view_names
 from small_runs import Inline, small
 
 from imagine_bench import registry
@@ -59,12 +58,7 @@ def test_verifies(imagined: Path) -> None:
 
 def by_step(path: Path, entity: str, column: str) -> list[Any]:
     """The values that were logged for an entity, in the order of its real steps."""
-    found = []
-    for chunk in RrdReader(path).stream():
-        batch = chunk.to_record_batch()
-        if chunk.entity_path == entity and {column, "env_step"} <= set(batch.schema.names):
-            found += zip(batch.column("env_step").to_pylist(), batch.column(column).to_pylist(), strict=True)
-    return [value for _, (value,) in sorted(found, key=lambda pair: pair[0])]
+    return [value for _, (value,) in logged(path, entity, column, "env_step")]
 
 
 class _HandsOver(FakeImaginer):
@@ -86,7 +80,7 @@ class _SeesAndExplores(FakeAgent):
     """Has learned to see, in two steps, and says how unknown each action is."""
 
     def perceived(self) -> list[Perceived]:
-        return [Perceived(n, (2,) * n, np.full((8, 8, 3), n, dtype=np.uint8)) for n in (0, 3)]
+        return [Perceived(5 * n, (2,) * n, np.full((8, 8, 3), n, dtype=np.uint8)) for n in (0, 3)]
 
     def novelty(self, observation: Observation, rng: np.random.Generator) -> NDArray[np.float32]:
         return rng.random(6, dtype=np.float32)
@@ -96,6 +90,10 @@ def test_a_recording_shows_perception_first_and_unknown_steps(imagined: Path, tm
     path = record(_SeesAndExplores(), tmp_path / "tells.rrd", name="random")
     looked, acted = times(path, "/seen/factors", "sim_time"), times(path, "/real/reward", "sim_time")
     assert len(looked) == 2 and max(looked) < min(acted)
+    assert by_step(path, "/real/text", "TextDocument:text")[:2] == [
+        f"In training episode {words}."
+        for words in ("0 it tells apart nothing yet", "15 it tells apart 3 things, of 2, 2, 2 values")
+    ]
     asked = {step - 1 for step in times(path, "/real/reward", "env_step")}
     assert times(path, "/real/novelty/turn_the_left_cube_clockwise", "env_step") == asked
     assert not any("novelty" in path or "seen" in path for path in contents(imagined))
@@ -222,33 +220,39 @@ def test_an_episode_that_is_lost_says_why(info: dict[str, object], terminated: b
     assert ending(info, terminated=terminated) == words
 
 
-def shape(kind: str, **changes: object) -> Shape3D:
-    values = {"size": np.array([0.1, 0.2, 0.3]), "pose_in_body": np.array([0, 0, 0, 1.0, 0, 0, 0]), "rgba": np.ones(4)}
-    return Shape3D(name=kind, body="body", kind=kind, **{**values, **changes})  # type: ignore[arg-type]
-
-
-def test_every_kind_of_shape_is_drawn_and_others_refused(tmp_path: Path) -> None:
-    kinds = ("box", "sphere", "capsule", "cylinder", "ellipsoid")
-    triangle = shape("mesh", vertices=np.eye(3), faces=np.array([[0, 1, 2]]))
-    with recording_file(tmp_path / "shapes.rrd", "test", NOTHING) as file:
-        log_shapes(file, [*(shape(kind) for kind in kinds), triangle, shape("box", size=np.full(3, 4.0))])
-    found = contents(tmp_path / "shapes.rrd")
-    assert set(found) >= {f"/scene/body/{kind}" for kind in (*kinds, "mesh")}
+def test_a_shape_that_cannot_be_drawn_is_refused() -> None:
+    """Those that can be are in ``tests/whole``."""
+    pose = np.array([0, 0, 0, 1.0, 0, 0, 0])
+    cone = Shape3D(name="cone", body="body", kind="cone", size=np.ones(3), pose_in_body=pose, rgba=np.ones(4))
     with pytest.raises(InvalidValueError, match="is of kind 'cone'"), rr.RecordingStream("test") as file:
-        log_shapes(stream.Recording(file), [shape("cone")])
+        log_shapes(stream.Recording(file), [cone])
 
 
-def test_bodies_that_stand_still_get_no_new_poses(tmp_path: Path) -> None:
+def test_a_motion_ends_now_and_bodies_that_stand_still_get_no_new_poses(tmp_path: Path) -> None:
     poses = np.zeros((4, 2, 7))
     poses[..., 3] = 1.0
     poses[:, 1, 0] = np.arange(4)
     motion = Motion(body_names=("still", "moves"), time_s=np.arange(4) / 20.0, poses_in_world=poses)
     with recording_file(tmp_path / "motion.rrd", "test", NOTHING) as file:
         file.set_clocks(env_step=3)
+        file.clock_s = 2.0
         log_motion(file, motion)
-    found = contents(tmp_path / "motion.rrd")
-    assert "/scene/moves" in found
-    assert "/scene/still" not in found
+    moves = logged(tmp_path / "motion.rrd", "/scene/moves", "Transform3D:translation", "sim_time")
+    assert [at.total_seconds() for at, _ in moves] == [1.85, 1.9, 1.95, 2.0]
+    assert [x for _, ((x, _, _),) in moves] == [0, 1, 2, 3]
+    assert "/scene/still" not in contents(tmp_path / "motion.rrd")
+
+
+def test_the_view_looks_at_the_place_of_the_objects(tmp_path: Path) -> None:
+    with (
+        closing(gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic")) as env,
+        recording_file(tmp_path / "view.rrd", "test", NOTHING, env=env) as file,
+    ):
+        env.reset(seed=0)
+        file.show()
+        scene: Any = env.unwrapped
+        cubes = [scene.data.body(f"cube_{number}").xpos for number in range(3)]
+    np.testing.assert_allclose(file.look_target_m[:2], np.mean(cubes, axis=0)[:2], atol=0.1)
 
 
 def labelled(states: NDArray[np.int64], appearance: str, rng: np.random.Generator) -> NDArray[np.uint8]:

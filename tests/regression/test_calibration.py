@@ -55,7 +55,7 @@ class Knowing:
         return Prediction(
             weights=np.ones(wrong.shape),
             means=constant[..., None],
-            sigmas=np.full((*wrong.shape, 1), 1e6),
+            sigmas=np.full((*wrong.shape, 1), 20.0),
             prediction=prediction,
             mean=prediction,
             epistemic=wrong,
@@ -72,11 +72,15 @@ def test_errors_are_paired_with_the_scores_of_the_same_points() -> None:
     task = registry.regression("toy_regression")
     tests = [task.testing("base", np.random.default_rng(seed), 130) for seed in (0, 1)]
     found = calibrate(task, "base", tests, Knowing(), np.random.default_rng(0))  # type: ignore[arg-type]
-    assert found["wrong"].shape == (2,) and found["error_mean"][0] != found["error_mean"][1]
-    for network in (0, 1):
+    for network, test in enumerate(tests):
         row = {name: values[network] for name, values in found.items()}
-        assert 0.0 < row["wrong"] < 1.0
+        errors = task.errors("base", test.inputs, np.zeros((130, 1)))
+        assert 0.0 < row["wrong"] == (errors > 3.0).mean() < 1.0
+        assert (row["error_mean"], row["error_median"]) == (errors.mean(), np.median(errors))
+        assert row["log_score"] == pytest.approx(-stats.norm.logpdf(test.targets, 0.0, 20.0).mean())
+        for level in (0.5, 0.8, 0.95):
+            within = abs(test.targets) <= 20.0 * stats.norm.ppf(0.5 + level / 2)
+            assert row[f"coverage_{level:g}"] == within.mean()
         assert row["auroc_epistemic"] == 1.0
         assert row["auroc_modal"] == row["auroc_nll"] == 0.0
         assert row["auroc_total"] == row["auroc_aleatoric"] == row["auroc_stationarity"] == 0.5
-        assert row["coverage_0.5"] == 1.0, "so wide: every outcome is near its median"

@@ -25,6 +25,7 @@ from imagine_bench.recording.filmstrips import (
     WRONG,
     Tile,
     changes,
+    rgb,
     sampled_filmstrips,
 )
 from imagine_bench.report import bench_page
@@ -72,44 +73,40 @@ def test_the_values_of_rollouts_are_not_clipped() -> None:
     assert ends[0] + 30 < ends[1] < many.shape[0] - 4, "more lines, and nothing at the edge"
 
 
-def test_a_strip_marks_cut_error_and_end() -> None:
-    names = tuple(f"turn cube {index}" for index in range(6))
-    cut, whole = (filmstrips.filmstrip(compared_rollout(np.random.default_rng(0), cut=cut), names) for cut in (3, None))
-    assert cut.shape == whole.shape
-    assert (cut == filmstrips.CUT).all(axis=2).sum() > 500  # the line
-    assert not (whole == filmstrips.CUT).all(axis=2).any()
-    assert all((whole == color).all(axis=2).sum() > 500 for color in (RIGHT, WRONG)), "borders in both colors"
-
-
-def test_real_frames_are_shown_unaltered_and_upright() -> None:
-    compared = compared_rollout(np.random.default_rng(0), cut=None)
-    strip = filmstrips.filmstrip(compared, tuple("abcdef"))
-    shown = strip[TITLE_PX : TITLE_PX + CELL_PX : 2, LABELS_PX : LABELS_PX + CELL_PX : 2]
-    np.testing.assert_array_equal(shown, compared.start_frame)
-
-
 @pytest.mark.parametrize("last", [0, 2, 3, 4, 9])
 @pytest.mark.parametrize("carried_out", [5, 4])
-def test_every_macro_action_is_judged_up_to_the_one_that_ends_the_episode(last: int, carried_out: int) -> None:
-    """The third is imagined wrongly. After the end real frames are pale, and nothing is judged that was not done."""
-    compared = compared_rollout(np.random.default_rng(0), cut=None)
+def test_a_strip_sets_each_prediction_beside_the_truth(last: int, carried_out: int) -> None:
+    """The third is imagined wrongly, and the filter cuts the fourth.
+
+    After the end real frames are pale, and nothing is judged that was not done.
+    """
+    compared = compared_rollout(np.random.default_rng(0))
+    rewards = ("-1.0", "+2.0", "-3.0", "+4.0", "+0.0")[:carried_out]
     compared = dataclasses.replace(
         compared,
         real_frames=compared.real_frames[:carried_out],
         real_macrostates=compared.real_macrostates[:carried_out],
-        real_rewards=compared.real_rewards[:carried_out],
+        real_rewards=np.array([float(reward) for reward in rewards]),
         real_terminated=(np.arange(5) >= last)[:carried_out],
     )
+    of = compared.rollout
+    real, imagined = [Tile(compared.start_frame, "start")], [Tile(rgb(of.start_frame), "", "\npredicted\n(true)")]
+    for step in range(5):
+        is_real, over, cut = step < carried_out, last < step <= carried_out, step == 3
+        right = step != 2 if is_real and not over else None
+        verdict = {True: "as the rules say", False: "not as the rules say", None: "episode over" * over}[right]
+        truth = f" ({rewards[step]})" if is_real else ""
+        lines = [verdict, f"reward {of.rewards[step]:+.1f}{truth}", f"P(end) {of.p_terminated[step]:.2f}"]
+        words = "\n".join([*lines, f"epistemic {of.epistemic[step]:.2g}", "filter cuts here" * cut])
+        frame = compared.real_frames[step] if is_real else None
+        real.append(Tile(frame, f"{step + 1}. {'abcdef'[of.actions[step]]}", pale=over, cut=cut))
+        imagined.append(Tile(rgb(of.frames[step]), "", words, right, pale=step > 2, cut=cut))
     strip = filmstrips.filmstrip(compared, tuple("abcdef"))
-    judged, shown = [], []
-    for index in range(5):
-        left = LABELS_PX + (index + 1) * STEP_PX
-        judged.append(colored(strip[:, left - 8 : left + STEP_PX - 8]))
-        whole = strip[TITLE_PX : TITLE_PX + CELL_PX : 2, left : left + CELL_PX : 2]
-        shown.append(index < carried_out and bool((whole == compared.real_frames[index]).all()))
-    counts = [index <= min(last, carried_out - 1) for index in range(5)]
-    assert shown == counts
-    assert judged == [[counts[index] and index != 2, counts[index] and index == 2] for index in range(5)]
+    np.testing.assert_array_equal(strip, filmstrips.sheet([("real", real), ("imagined", imagined)]))
+    assert (strip == filmstrips.CUT).all(axis=2).sum() > 500, "the line"
+    left = LABELS_PX + 5 * STEP_PX
+    shown = strip[TITLE_PX : TITLE_PX + CELL_PX : 2, left : left + CELL_PX : 2]
+    assert np.array_equal(shown, compared.real_frames[-1]) == (carried_out == 5 and last >= 4), "else it is pale"
 
 
 def recorded(length: int, success: bool) -> RecordedEpisode:
@@ -141,11 +138,6 @@ def test_the_rewards_of_an_episode_are_shown_with_their_fractions() -> None:
     assert [filmstrips.signed(reward) for reward in (-1.5, -0.5, 50.0, 0.0, -1.234)] == [
         *("-1.5", "-0.5", "+50", "+0", "-1.23")
     ]
-    strips = []
-    for reward in (-1.5, -2.0):
-        episode = dataclasses.replace(recorded(1, success=False), rewards=np.array([reward]))
-        strips.append(filmstrips.episode_strip(episode, PICK_PLACE.action_names))
-    assert (strips[0] != strips[1]).any()
 
 
 def numbered(actions: list[int]) -> list[Tile]:
@@ -154,11 +146,14 @@ def numbered(actions: list[int]) -> list[Tile]:
     return [Tile(None, above) for above in ("start", *words)]
 
 
-def test_the_macro_actions_of_an_episode_are_numbered_from_one() -> None:
-    strip = filmstrips.episode_strip(recorded(3, success=True), PICK_PLACE.action_names)
-    expected = filmstrips.sheet([("", numbered([0, 1, 2]))])
-    top = TITLE_PX - 4  # where the border begins
-    np.testing.assert_array_equal(strip[:top], expected[:top])
+def test_the_macro_actions_of_an_episode_stand_with_their_rewards() -> None:
+    episode = dataclasses.replace(recorded(3, success=True), rewards=np.array([-1.5, -0.5, 50.0]))
+    below = ["", "reward -1.5", "reward -0.5", "reward +50\nsolved"]
+    tiles = zip(numbered([0, 1, 2]), episode.frames, below, strict=True)
+    expected = [tile._replace(frame=frame, below=words) for tile, frame, words in tiles]
+    expected[-1] = expected[-1]._replace(right=True)
+    strip = filmstrips.episode_strip(episode, PICK_PLACE.action_names)
+    np.testing.assert_array_equal(strip, filmstrips.sheet([("real frames", expected)]))
 
 
 def test_the_macro_actions_of_an_overrated_policy_are_numbered_from_one() -> None:
@@ -201,6 +196,13 @@ def test_impossible_steps_are_marked_unless_frames_hide_something() -> None:
     hidden: TaskSpec = dataclasses.replace(PICK_PLACE, sight=registry.task("pick_place:gesture=first").sight)
     right = rollout(START, ASKS_RIGHT, IMPOSSIBLE)  # right at first, then a step that is impossible
     wrong = rollout(START, IMPOSSIBLE, ASKS_RIGHT)
-    assert colored(sampled_filmstrips((right,), PICK_PLACE)) == [True, True]
+    ends = dataclasses.replace(right.rollout, p_terminated=np.array([0.4, 0.6], dtype=np.float32))
+    told = [
+        Tile(right.start_frame),
+        Tile(rgb(ends.frames[0]), PICK_PLACE.action_names[0], "left object\npicked, gesture\nright", right=True),
+        Tile(rgb(ends.frames[1]), PICK_PLACE.action_names[0], "middle object\npicked; the end", right=False),
+    ]
+    shown = sampled_filmstrips((dataclasses.replace(right, rollout=ends),), PICK_PLACE)
+    np.testing.assert_array_equal(shown, filmstrips.sheet([("the real start", told)]))
     assert colored(sampled_filmstrips((wrong,), PICK_PLACE)) == [False, True]
     assert colored(sampled_filmstrips((right, wrong), hidden)) == [False, False]

@@ -27,6 +27,7 @@ _FEW = {"budgets": (2,), "evaluation_episodes": 3, "execution": "kinematic", "re
     [
         ("dqn", "dqn", ""),
         ("dqn:b.y=1,a.x=[256, 256]", "dqn:a.x=[256,256],b.y=1", "x [256,256], y 1"),
+        ("dqn:b.x=1,a.x=2", "dqn:a.x=2,b.x=1", "a.x 2, b.x 1"),
         ('dqn:a.x="0.5",a.y=null', 'dqn:a.x="0.5",a.y=null', 'x "0.5", y null'),
     ],
 )

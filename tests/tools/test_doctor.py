@@ -99,6 +99,12 @@ def test_versions_that_are_not_the_locks_are_named(tmp_path: Path) -> None:
 def test_missing_gl_and_a_full_disk_are_complaints_and_exit_code_1(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.setattr(doctor, "machine", lambda: {**environment.machine(), "gpu": "a card"})
+    monkeypatch.setattr(doctor, "gl_renderer", lambda: "Mesa, llvmpipe")
+    assert main(["doctor"]) == 0
+    said = capsys.readouterr().out
+    assert "NVIDIA GPU" in said.partition("a card\n")[0].splitlines()[-1]
+    assert "Note: Frames are drawn in software (Mesa, llvmpipe) although there is a GPU; " in said
     monkeypatch.setattr(doctor, "gl_renderer", mock.Mock(side_effect=SetupError("No OpenGL: install libegl1.")))
     monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=2**29))
     assert main(["doctor"]) == 1

@@ -37,6 +37,16 @@ def times(path: Path, entity: str, timeline: str) -> set[int]:
     }
 
 
+def logged(path: Path, entity: str, column: str, timeline: str) -> list[tuple[Any, Any]]:
+    """The times at which a component of an entity was logged, and its values, in the order of the times."""
+    found = []
+    for chunk in RrdReader(path).stream():
+        batch = chunk.to_record_batch()
+        if chunk.entity_path == entity and {column, timeline} <= set(batch.schema.names):
+            found += zip(batch.column(timeline).to_pylist(), batch.column(column).to_pylist(), strict=True)
+    return sorted(found, key=lambda pair: pair[0])
+
+
 def view_names(path: Path) -> set[str]:
     """The names of the views in the recording's blueprint."""
     reader = RrdReader(path)

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 from guest_packages import Guests
 from kept import ROOT
-from recordings import as_text, contents, times, view_names
+from recordings import contents, logged, times, view_names
 from report_pages import page_in_words
 from same_values import assert_same
 from whole_outputs import Expected, short
@@ -320,9 +320,19 @@ def test_a_model_of_theirs_is_judged(said: Said) -> None:
     assert {"/action", "/real/frame", "/exact/frame", "/nearest/outcomes"} <= contents(recorded).keys()
     assert times(recorded, "/exact/frame", "depth") == set(range(11))
     names = registry.task("pick_place").action_names
-    text = as_text(recorded)
-    for depth, action in enumerate(shown(said.folder, _of("exact"))["exact"]["futures_actions"][0], 1):
-        assert f"{depth:02d}: ['**{depth}. {names[action]}**']" in text
+    one = shown(said.folder, _of("exact"))["exact"]
+
+    def logged_by_depth(entity: str, column: str) -> list[Any]:
+        """But for the start."""
+        return [value for _, (value,) in logged(recorded, entity, column, "depth")][1:]
+
+    actions = logged_by_depth("/action", "TextDocument:text")
+    assert actions == [f"**{depth}. {names[action]}**" for depth, action in enumerate(one["futures_actions"][0], 1)]
+    for name, of in (("real", "real"), ("exact", "imagined")):
+        frames = logged_by_depth(f"/{name}/frame", "Image:buffer")
+        assert np.array_equal(np.ravel(frames), np.ravel(one[f"futures_{of}"][0]))
+        for text, shares in zip(logged_by_depth(f"/{name}/outcomes", "TextDocument:text"), one["futures"][of], strict=True):
+            assert text == "\n".join(f"- {shares[each]:.0%} {each}" for each in sorted(shares, key=shares.get, reverse=True))
     scored = _cells(said, "copy", "exact")
     exact = scored["exact", 60]
     assert [pytest.approx(each) for each in exact["futures"]["real"]] == exact["futures"]["imagined"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections import Counter
 from pathlib import Path
@@ -11,6 +12,8 @@ import pytest
 from board_forging import BoardForger, honest_board
 from board_kinds import KINDS
 from imagine_bench_board.check import Checked, check
+from imagine_bench_board.page import board_page
+from imagine_bench_board.rows import Row
 
 VARIANTS = 23
 """Of each kind, in the slow test: 529 forgeries."""
@@ -47,6 +50,15 @@ def test_honest_rows_hold(honest: Path) -> None:
     found = check(honest)
     assert [each.verdict.complaint for each in found] == [""] * 8
     assert Counter(each.row.starts for each in found if each.row) == {"open starts": 4, "round winter": 4}
+    last = {
+        row.name: np.mean([each.successes for each in row.vouched][-1 :: -len(row.protocol.budgets)])
+        / row.protocol.evaluation_episodes
+        for row in (each.row for each in found)
+        if isinstance(row, Row)
+    }
+    table = board_page(found).sections[0].tables[0]
+    shown = [last[re.split('"|[.]html', row[1])[1]] for row in table.rows if "href" in row[1]]
+    assert shown == sorted(last.values(), reverse=True), "the best come first"
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-from datetime import date, timedelta
-from pathlib import Path
+import os
+import time
+from datetime import UTC, date, datetime, timedelta
+from unittest import mock
 
 import pytest
 from board_forging import on
 from imagine_bench_board.daily import world_of_day
+from imagine_bench_board.rounds import today
 
 from imagine_bench import registry
 from imagine_bench.cli import exit_code
@@ -35,18 +38,15 @@ def test_a_secret_hides_the_world_and_the_digest_binds_it() -> None:
 def test_today_is_the_day_by_default() -> None:
     with on(date(2026, 12, 3)):
         assert world_of_day() == world_of_day("2026-12-03")
+    for zone in ("XXX+14", "XXX-14"):  # it is another day there, for some hours of each
+        with mock.patch.dict(os.environ, TZ=zone):
+            time.tzset()
+            assert today() == datetime.now(UTC).date()
+    time.tzset()
 
 
-@pytest.mark.slow
-def test_an_agent_is_run_on_the_world(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = f"daily --date 2026-12-01 --agents oracle random --budgets 2 --launcher this_process --out {tmp_path}"
-    assert exit_code(words.split()) == 0
-    said = capsys.readouterr().out
-    world = world_of_day("2026-12-01")
-    assert world.task in said and world.digest in said and "oracle" in said
-    assert list(tmp_path.glob("*/*/oracle/seed_0/DONE"))
-
-
-def test_options_of_runs_go_with_agents(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_says_the_world_and_takes_options_of_runs_with_agents(capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_code(["daily", "--date", DAYS[0]]) == 0
+    assert capsys.readouterr().out == f"{world_of_day(DAYS[0])}\n"
     assert exit_code("daily --date 2026-12-01 --budgets 3".split()) == 2
     assert "--budgets goes with --agents; leave it out" in capsys.readouterr().err

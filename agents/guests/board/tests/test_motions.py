@@ -22,9 +22,11 @@ from imagine_bench_board.motion_rows import MotionRow, PlayedMotion, read_motion
 from imagine_bench_board.motions import SLACK_PERIODS, MotionTests
 from imagine_bench_board.page import write_board
 from imagine_bench_board.rows import LONGEST
+from report_pages import in_words
 
 from imagine_bench.arrays import Floats32
 from imagine_bench.errors import CheckFailedError, ImagineBenchError, InvalidValueError
+from imagine_bench.report.page import decimals
 
 WORLD = "arrows:cubes=1"
 TESTS = 4
@@ -107,10 +109,18 @@ def test_an_honest_row_holds_and_says_what_happened(row: OpenMotions, tmp_path: 
         f"{read.name}: holds in {WORLD}, continuous control at 25 Hz, clean; open starts; 4 episodes played again; "
         f"not vouched: {', '.join(NOT_VOUCHED)}"
     )
-    page = write_board([found], tmp_path / "page").read_text()
-    assert "continuous control at 25 Hz" in page
+    assert isinstance(found.row, MotionRow)
+    worse = dataclasses.replace(found.row, name="worse", vouched=dataclasses.replace(read.vouched, mean_return=-1.0))
+    page = write_board([dataclasses.replace(found, row=worse), found], tmp_path / "page").read_text()
     assert page.count(f'href="{read.name}.html#tests"') == 5, "each number that is vouched for leads to its episodes"
-    assert "2 of 4 tests solved" in (tmp_path / "page" / f"{read.name}.html").read_text()
+    shown = in_words(page)
+    seconds = sum(len(each.commands) for each in read.motions) / TESTS / 25
+    rest = f"{decimals(seconds)} | 0 | 0 | 4 | open starts |"
+    best, other = (f"expert | 50.0 | {number} | {rest}" for number in (decimals(read.vouched.mean_return), "−1.00"))
+    assert 0 < shown.index(best) < shown.index(other), shown
+    linked = in_words((tmp_path / "page" / f"{read.name}.html").read_text())
+    assert "2 of 4 tests solved" in linked
+    assert f"\n1 | {read.protocol.start(1)} | 30.00 | 0 | no | no | yes\n" in linked, linked
     row.protocol.update(task=f"{WORLD},slip=0", appearance="light=0")
     assert "holds" in str(row.check()) and read_motions(row.folder).world == read.world, "the same world in other words"
 

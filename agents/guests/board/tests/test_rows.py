@@ -8,6 +8,7 @@ import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import bench_fakes  # noqa: F401 - registers its agents
 import pytest
@@ -18,14 +19,14 @@ from imagine_bench_board.page import write_board
 from imagine_bench_board.rows import CARD, EPISODES, LARGEST, LONGEST, read_row, world_words
 from imagine_bench_board.submit import submit
 from report_pages import in_words
-from small_runs import Inline, small
+from small_runs import QUICK, Inline, small
 from whole_outputs import expected_of
 
 from imagine_bench.cli import exit_code
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.exact.certificate import certificate
 from imagine_bench.report.page import percent
-from imagine_bench.running.bench import bench
+from imagine_bench.running.bench import bench, plan
 from imagine_bench.seeding import TUNING_SEEDS
 from imagine_bench.store.bench_folder import bench_facts
 from imagine_bench.store.run_folder import load_run
@@ -83,14 +84,29 @@ def test_a_page_that_cannot_be_written_is_said_before_the_check(
     assert not said.out and "page" in said.err
 
 
-@pytest.mark.parametrize(("shown", "frames"), [(0, 0), (2, None)])
-def test_frames_of_demonstrations_are_not_said_to_be_none(tmp_path: Path, shown: int, frames: int | None) -> None:
-    wanted = small(budgets=(4,), demonstrations=shown)
-    done = bench(wanted, {}, root=tmp_path / "bench", launcher=Inline())
-    (folder,) = submit(done.folder, tmp_path / "rows", author="", round_folder=None, encoder=None)
+@pytest.mark.parametrize(
+    ("changes", "frames", "seen"),
+    [
+        ({}, 0, "nothing"),
+        ({"demonstrations": 2}, None, "2 demonstrations"),
+        ({"agents": ("pupil",), "queries": 3, "feedback": 1.0}, 0, "3 oracle queries an episode; a teacher's feedback"),
+        (
+            {"after": ("arrow_puzzle_hard",), "after_episodes": 3, "unannounced": True},
+            None,
+            "3 episodes of arrow_puzzle_hard",
+        ),
+        ({"agents": ("oracle",)}, 0, "privileged: true macrostates"),
+        ({"agents": ("dqn",)}, 24_000, "encoder arrow_puzzle-clean@"),
+    ],
+)
+def test_all_that_was_seen_beforehand_is_said(
+    tmp_path: Path, changes: dict[str, Any], frames: int | None, seen: str
+) -> None:
+    few = {"agents": ("table",), "budgets": (3,), "evaluation_episodes": 1, "seeds": (0,), **QUICK}
+    done = bench(*plan("arrow_puzzle", "smoke", **{**few, **changes}), root=tmp_path / "bench", launcher=Inline())
+    folder, *_ = submit(done.folder, tmp_path / "rows", author="", round_folder=None, encoder=None)
     claimed = read_row(folder).claimed
-    assert claimed.frames_beforehand == frames
-    assert claimed.seen_beforehand == (f"{shown} demonstrations" if shown else "nothing")
+    assert claimed.frames_beforehand == frames and claimed.seen_beforehand.startswith(seen)
 
 
 def test_rows_of_unlike_tests_stand_in_tables_of_their_own() -> None:
@@ -135,6 +151,10 @@ def test_a_long_command_is_cut(run: Path, tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_the_check_says_each_verdict_in_one_line(row: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    opened = OpenRow(row)
+    for price, steps in zip(opened.card["claimed"]["prices"], (4, 90, 40, 0), strict=True):
+        price["env_steps"] = steps  # all that 4 and 9 episodes can have had, and no training
+    opened.write()
     assert exit_code(["board", "check", str(row)]) == 0
     said = capsys.readouterr().out.splitlines()
     assert said[0] == (
@@ -142,7 +162,6 @@ def test_the_check_says_each_verdict_in_one_line(row: Path, capsys: pytest.Captu
         f"not vouched: {', '.join(NOT_VOUCHED)}"
     )
     assert said[1] == NEVER_SHOWN and said[2].startswith("24 episodes; checked in ")
-    opened = OpenRow(row)
     opened.card["vouched"][2]["successes"] += 1
     opened.write()
     assert exit_code(["board", "check", str(row.parents[1])]) == 1
@@ -212,6 +231,8 @@ def test_a_hostile_file_is_refused_in_one_sentence(row: Path, attack: str) -> No
         ("claimed", "command", "x" * 301, "give at most 300 printable characters"),
         ("claimed", "frames_beforehand", -1, "frames_beforehand is -1; give 0 to 1,000,000,000,000."),
         ("claimed", "frames_beforehand", 10**400, "give 0 to 1,000,000,000,000."),
+        ("price", "env_steps", 3, "3 macro-actions cannot be those of 4 training episodes."),
+        ("price", "env_steps", 41, "41 macro-actions cannot be those of 4 training episodes."),
         ("protocol", "preset", "\ud800", "surrogates not allowed"),
         ("protocol", "task", "arrows:@/etc/passwd", "its task names a file"),
         ("protocol", "task", "../arrows", "No task '../arrows'"),
@@ -225,6 +246,7 @@ def test_a_hostile_card_is_refused_in_one_sentence(
 ) -> None:
     opened = OpenRow(row)
     parts = {"card": opened.card, "figures": opened.card["vouched"][0], **opened.card}
+    parts["price"] = opened.card["claimed"]["prices"][0]
     parts[part][name] = value
     opened.write()
     is_refused(row, sentence)

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from imagine_bench_programs import __main__ as commands
 from imagine_bench_programs.__main__ import written
-from imagine_bench_programs.agent import LawsAgent
+from imagine_bench_programs.agent import LawsAgent, ProgramAgent
+from imagine_bench_programs.program import Program
 from imagine_bench_programs.seeing import Hidden, hidden_value, still_value
 from imagine_bench_programs.symbols import Symbols
 from imagine_bench_programs.writing.delay import CodedRow
@@ -438,6 +439,22 @@ def test_the_agents_expectations_are_those_of_its_laws() -> None:
     expected = [{tuple(place): share for place, share in zip(*each, strict=True) if share} for each in branches]
     assert expected == [{(11, 10): 1.0}, {(10, 11): 0.5, (10, 10): 0.5}, {}, {(12, 10): 0.5, (12, 11): 0.5}]
     np.testing.assert_array_equal(found.reward, [[0.0, 0.5], [5.0, 0.5]])
+
+
+def test_what_a_program_remembers_goes_with_the_state_until_the_episode_ends(tmp_path: Path) -> None:
+    """A count of steps, whose parity says which macro-action pays in the next; the program ends after two."""
+    file = tmp_path / "counts.py"
+    pays = "def outcomes(s, a, m):\n n = (m or 0) + 1\n return {((1,), float(a == n % 2), n > 1, n): 1.0}\n"
+    file.write_text(pays)
+    counts = Program(str(file), (2,), 2)
+    once = counts.follow(counts.start((0,)), 0, (1,))
+    assert not counts.outcomes(counts.start((0,)), 0)[0].terminated and counts.outcomes(once, 0)[0].terminated
+    assert counts.follow(once, 0, (0,)) == counts.start((0,)), "an unexpected symbol forgets"
+    agent = ProgramAgent(ByteSymbols((2,)), counts)
+    seen = Observation(frame=np.ones((64, 64, 3), dtype=np.uint8))
+    for _ in range(2):
+        agent.begin_episode()
+        assert [agent.act(seen, explore=False) for _ in range(3)] == [1, 0, 1]
 
 
 def test_an_agent_plans_from_its_macro_actions_of_this_episode_alone() -> None:

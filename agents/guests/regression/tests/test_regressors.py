@@ -78,9 +78,12 @@ def test_hidden_layers_decay_and_the_output_layer_does_not() -> None:
 @pytest.mark.parametrize(("batch_size", "updates"), [(None, 1), (250, 3), (8, 75)])
 def test_an_epoch_takes_the_fewest_batches_of_at_most_that_size(batch_size: int | None, updates: int) -> None:
     line = RegressionData(inputs=np.linspace(-1, 1, 600)[:, None], targets=np.ones((600, 1)))
-    model = regressor("mc_dropout", [line], [0], hidden=(4, 4), batch_size=batch_size, epochs=2)
-    model.train(silent)
+    falling = {"learning_rate": 0.01, "final_rate": 0.2}
+    model = regressor("mc_dropout", [line], [0], hidden=(4, 4), batch_size=batch_size, epochs=2, **falling)
+    rates = list[float]()
+    model.train(lambda done, epochs: rates.append(model.optimiser.learning_rate))
     assert model.network.batches == 2 * updates
+    assert rates == pytest.approx([0.01, 0.006]), "half a cosine from the first rate to a fifth of it"
 
 
 @pytest.mark.parametrize("name", MAKERS)
@@ -107,6 +110,16 @@ def test_variances_are_those_of_what_weight_samples_draw(name: str) -> None:
     assert drawn.shape == (2, 20, 16, 1)
     assert abs(drawn.mean()) < 0.2 and abs(drawn.var() - 1.0) < 0.25
     assert len(np.unique(drawn)) == drawn.size
+
+
+def test_the_first_batches_count_equally_in_running_statistics() -> None:
+    network = NormedMLP((2, 4, 1), generators=[generator()], dropout=0.0)
+    x, _ = data(3)
+    for batch in x:
+        network(batch.mT[None].contiguous(), None)
+        network.update_running_stats()
+    for name, expected in (("mean", x.mean(dim=(0, 1))), ("variance", x.var(dim=1, correction=0).mean(dim=0))):
+        torch.testing.assert_close(network.get_buffer(f"{name}_0")[0, :, 0], expected)
 
 
 def test_dropped_units_are_dropped_after_folding_too() -> None:

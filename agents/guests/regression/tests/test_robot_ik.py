@@ -13,7 +13,7 @@ import pytest
 from imagine_bench_regression import robot_ik as ik
 from imagine_bench_regression.planar_arm import MOVE_S, PlanarArm
 from imagine_bench_regression.recordings import CHOICES, record_robot
-from rerun.chunk import RrdReader
+from recordings import logged
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.regression import Prediction
@@ -131,12 +131,13 @@ def test_decisions_are_carried_out_by_the_arm(monkeypatch: pytest.MonkeyPatch) -
         np.testing.assert_allclose(reached, forward(found[f"{part}/joints"]), atol=2e-4)
         np.testing.assert_array_equal(found[f"{part}/error"], np.linalg.norm(reached - points, axis=-1))
     assert not np.array_equal(found["decision/points"][0], found["decision/points"][1]), "networks are asked elsewhere"
+    np.testing.assert_array_equal(found["babbling"], ik.training("100", SeedTree(0).child("data").generator()).inputs)
     outside = found["map/outside_m"] > 0
     assert np.isnan(found["map/error"][:, outside]).all() and np.isfinite(found["map/error"][:, ~outside]).all()
 
 
-def test_a_recorded_choice_says_by_how_many_centimetres_it_misses(tmp_path: Path) -> None:
-    """Of the least uncertain candidate, and of all on average."""
+def test_a_recording_shows_the_surest_choice_and_by_how_much_it_misses(tmp_path: Path) -> None:
+    """It misses by the line from the place reached to the place asked for. All candidates miss by more on average."""
     shape = (1, CHOICES, 3)
     rng = np.random.default_rng(10)
     data = {f"decision/{end}": rng.random((*shape, 2)) for end in ("points", "reached")}
@@ -144,12 +145,23 @@ def test_a_recorded_choice_says_by_how_many_centimetres_it_misses(tmp_path: Path
     data["decision/epistemic"] = np.tile([0.3, 0.1, 0.2], (*shape[:2], 1))
     data["decision/error"] = np.linspace(0.01, 0.9, CHOICES * 3).reshape(shape)
     path = record_robot({"100": data}, task=ik.SPEC, name="mdn", path=tmp_path / "arm.rrd")
-    chunks = [each.to_record_batch() for each in RrdReader(path).stream() if each.entity_path == "/choice/text"]
-    told = "\n".join(str(each.column("TextDocument:text").to_pylist()) for each in chunks)
-    errors_cm = 100.0 * data["decision/error"][0]
-    said = {
-        int(choice): [float(number) for number in re.findall(r"misses by ([\d.]+) cm", text)]
-        for choice, text in re.findall(r"### Choice (\d+)(.*?on average)", told)
-    }
-    for choice, errors in enumerate(errors_cm, start=1):
-        np.testing.assert_allclose(said[choice], [errors[1], errors.mean()], atol=0.051)
+
+    def shown(entity: str, column: str) -> dict[int, Any]:
+        """The last value of each choice."""
+        return dict(logged(path, f"/{entity}", column, "choice"))
+
+    texts = shown("choice/text", "TextDocument:text")
+    lines, rings = (shown(f"choice/{name}", "LineStrips3D:strips") for name in ("error_line", "chosen"))
+    colors = shown("choice/candidates", "Points3D:colors")
+    arms = shown("scene/link_3", "Transform3D:translation")
+    for choice, errors in enumerate(100.0 * data["decision/error"][0], start=1):
+        surest = (0, choice - 1, 1)
+        said = [float(number) for number in re.findall(r"misses by ([\d.]+) cm", texts[choice][0])]
+        np.testing.assert_allclose(said, [errors[1], errors.mean()], atol=0.051)
+        ends = [[*data[f"decision/{end}"][surest], 0.02] for end in ("reached", "points")]
+        np.testing.assert_allclose(lines[choice][0], ends, atol=1e-6)
+        np.testing.assert_allclose(np.mean(rings[choice][0][:-1], axis=0), ends[1], atol=1e-6)
+        assert [tuple(each.to_bytes(4)[:3]) for each in colors[choice]] == [(213, 94, 0), (0, 114, 178), (106, 104, 89)]
+        reaches = ik.arm().movement(data["decision/joints"][surest], 25.0)
+        link = reaches.poses_in_world[-1, reaches.body_names.index("link_3"), :3]
+        np.testing.assert_allclose(arms[choice][0], link, atol=1e-6)

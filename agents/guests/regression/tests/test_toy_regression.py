@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from imagine_bench_regression import toy_regression as toy
+from imagine_bench_regression.recordings import record_toy
+from recordings import logged
 from scipy import stats
 
 
@@ -34,3 +38,18 @@ def test_noise_is_three_times_as_large_in_the_noisy_region_only() -> None:
     x = np.array([-10.1, -10.0, 0.0, 10.0, 10.1])
     np.testing.assert_array_equal(toy.noise_sigma("high_noise", x), [1, 3, 3, 3, 1])
     np.testing.assert_array_equal(toy.noise_sigma("base", x), np.ones(5))
+
+
+def test_a_recording_shows_standard_deviations_beside_the_true_ones(tmp_path: Path) -> None:
+    """Of the first network, over 100 x; the training data in the order of x."""
+    x = np.array([-1.0, 0.0, 2.5])
+    data = {"x": x, "training_x": x[::-1], "training_y": x[::-1] ** 2, "prediction": np.stack([x + 1.0, x])}
+    curves = {"y/training": x**2, "y/prediction": x + 1.0}
+    for place, kind in enumerate(("epistemic", "modal", "aleatoric"), start=1):
+        data |= {kind: np.full((2, 3), 4.0 * place), f"true_{kind}": np.full(3, 9.0 * place)}
+        curves |= {f"{kind}/{name}": np.full(3, std * place**0.5) for name, std in (("estimated", 2.0), ("true", 3.0))}
+    path = record_toy({"base": data}, task=toy.SPEC, name="mdn", path=tmp_path / "toy.rrd")
+    for name, values in curves.items():
+        places, shown = zip(*logged(path, f"/base/{name}", "Scalars:scalars", "x_hundredths"), strict=True)
+        assert places == (-100, 0, 250)
+        np.testing.assert_allclose(np.ravel(shown), values)

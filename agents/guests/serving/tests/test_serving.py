@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 from imagine_bench_serving import server as module
 from imagine_bench_serving.players import Players, Served
-from imagine_bench_serving.server import MOST_BYTES, Server, serve
+from imagine_bench_serving.server import MOST_BYTES, Server, announce, serve
 from imagine_bench_serving.sockets import accept_key
 from imagine_bench_serving.words import briefing, seen_in_words
 from PIL import Image
@@ -336,9 +336,12 @@ def test_few_players_and_few_connections_are_let_in(tmp_path: Path, monkeypatch:
 
 def test_a_connection_that_says_nothing_is_closed(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module.Handler, "timeout", 0.5)
+    talk = Line(server)
     with socket.create_connection(("127.0.0.1", server.server_port), timeout=30) as silent:
         assert silent.recv(1) == b""
     assert ask(server, "/health")[0] == 200
+    assert talk.say(b'{"type": "state", "data": {"player": "ann"}}')["type"] == "state", "who thinks for long plays on"
+    talk.close()
 
 
 def silent_connection(server: Server) -> socket.socket:
@@ -364,13 +367,21 @@ def answers(server: Server) -> bool:
     return False
 
 
-def test_it_binds_to_this_machine_alone_and_says_where_it_cannot(tmp_path: Path, refusing: Server) -> None:
-    assert refusing.server_address[0] == "127.0.0.1" and refusing.is_local
+def test_it_binds_to_this_machine_alone_and_says_where_it_cannot(
+    tmp_path: Path, refusing: Server, capsys: pytest.CaptureFixture[str]
+) -> None:
+    announce(refusing)
+    at = f"http://127.0.0.1:{refusing.server_port}"
+    said = f"{SPEC.title}: {at}, MCP at {at}/mcp, OpenEnv at {at}. Ctrl-C ends it.\n"
+    assert capsys.readouterr().out == said and refusing.server_address[0] == "127.0.0.1"
     players = Players(Served(task="arrow_puzzle", execution="kinematic", out=tmp_path))
     with pytest.raises(SetupError, match=r"cannot be served at: .* give another --port"):
         Server(players, "127.0.0.1", refusing.server_port)
     with pytest.raises(SetupError, match="ports end at 65535"):
         Server(players, "127.0.0.1", 70_000)
+    with Server(players, "0.0.0.0", 0) as reachable:
+        announce(reachable)
+    assert "There is no key: whoever reaches this machine can play" in capsys.readouterr().out
     players.close()
     with pytest.raises(ImagineBenchError, match="players"):
         Players(Served(task="arrow_puzzle", most_players=0))
