@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from imagine_bench.judge.predictions import Predictions, ask_together, call, eva
 from imagine_bench.judge.questions import EvalSet
 from imagine_bench.judge.reading import READER_FILE, ImageReader, RenderedFrameIndex, making, reader_in
 from imagine_bench.judge.scores import (
+    CellScores,
     acceptance_scores,
     after_the_end_scores,
     by_depth,
@@ -266,7 +267,7 @@ def _is_whole(folder: Path, cell: ModelFit) -> bool:
     return found is not None and ("images" not in found or (folder / cell.images).exists())
 
 
-def _read(folder: Path, cell: ModelFit) -> dict[str, Any] | None:
+def _read(folder: Path, cell: ModelFit) -> CellScores | None:
     """A cell as it is kept; None where it is not, or its model's code, or its run, is another one now."""
     file = folder / cell.file
     found = read_sealed(file, "a judged cell") if file.exists() else {"code": None}
@@ -274,7 +275,7 @@ def _read(folder: Path, cell: ModelFit) -> dict[str, Any] | None:
     return found if found.get("code", now) == now else None
 
 
-def judge_cell(judgement: Judgement, folder: Path, cell: ModelFit) -> tuple[dict[str, Any], Arrays]:
+def judge_cell(judgement: Judgement, folder: Path, cell: ModelFit) -> tuple[CellScores, Arrays]:
     """The scores of one model, fitted once, and a few of its images beside the truth.
 
     Raises:
@@ -294,7 +295,7 @@ def judge_cell(judgement: Judgement, folder: Path, cell: ModelFit) -> tuple[dict
 
 def _judged(
     judgement: Judgement, folder: Path, cell: ModelFit, world: AskedWorld, judged: JudgedModel, seeds: SeedTree
-) -> tuple[dict[str, Any], Arrays]:
+) -> tuple[CellScores, Arrays]:
     asked = world.asked
     table = None
     if not judged.learns:  # its data and the cost of its training are its bench's to say
@@ -455,7 +456,7 @@ def _images(name: str, model: WorldModel, world: AskedWorld, worst: list[int], r
     return found
 
 
-def kept(folder: Path, judgement: Judgement) -> list[dict[str, Any]]:
+def kept(folder: Path, judgement: Judgement) -> list[CellScores]:
     """Every cell of a judgement that is kept. Raises ArtefactError: one is damaged."""
     cells = sorted(judgement.cells, key=lambda cell: judgement.models.index(cell.model))
     found = [today(each) for cell in cells if (each := _read(folder, cell)) is not None]
@@ -479,13 +480,13 @@ def kept(folder: Path, judgement: Judgement) -> list[dict[str, Any]]:
     return found
 
 
-def shown(folder: Path, judgement: Judgement) -> dict[str, dict[str, Any]]:
+def shown(folder: Path, judgement: Judgement) -> dict[str, CellScores]:
     """By model, the images and the cell of its first seed that are kept, after the most transitions.
 
     Raises:
         ArtefactError: A file is damaged, or images are lost.
     """
-    found: dict[str, dict[str, Any]] = {}
+    found: dict[str, CellScores] = {}
     for cell in kept(folder, judgement):
         model = cell["model"]
         images = folder / ModelFit(model, cell["seed"], cell["transitions"]).images

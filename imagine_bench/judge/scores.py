@@ -59,6 +59,8 @@ FORMER = {
 }
 """Today's name of each score that files kept before 2026-11-30 name otherwise."""
 Scores = dict[str, float]
+CellScores = dict[str, Any]
+"""Everything that is kept of one model, seed and size of data, as JSON has it."""
 T = TypeVar("T")
 Pairs = Sequence[tuple[Mapping[Value, float], Mapping[Value, float]]]
 """Exact and imagined probabilities of each question."""
@@ -91,7 +93,7 @@ def by_depth(questions: EvalSet, predictions: Predictions) -> dict[str, list[flo
 
 def one_step_scores(
     spec: TaskSpec, questions: EvalSet, predictions: Predictions, visited: set[tuple[State, int]] | None
-) -> dict[str, Any]:
+) -> CellScores:
     """Every score of single transitions. ``visited`` are the (macrostate, action) pairs in its data, or None."""
     pairs = _distributions(questions, predictions)
     away = _away(pairs)

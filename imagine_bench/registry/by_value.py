@@ -34,7 +34,8 @@ _NO_CODE = frozenset(
     )
 )
 """Attributes of a class that Python itself adds, or that change nothing that it does."""
-_CACHED = type(functools.cache(len))
+Cached = functools._lru_cache_wrapper
+"""A function that remembers its results."""
 _ATTRIBUTES: Mapping[type, tuple[str, ...]] = {
     CodeType: ("co_code", "co_consts", "co_names", "co_varnames", "co_freevars"),
     MethodType: ("__func__", "__self__"),
@@ -44,7 +45,7 @@ _ATTRIBUTES: Mapping[type, tuple[str, ...]] = {
     functools.partial: ("func", "args", "keywords"),
     property: ("fget", "fset", "fdel"),
     staticmethod: ("__func__",),
-    _CACHED: ("__wrapped__",),
+    Cached: ("__wrapped__",),
 }
 """The attributes that decide about an object of one of Python's own types."""
 _GENERATORS = (np.random.Generator, np.random.BitGenerator, np.random.RandomState, random.Random)
@@ -123,26 +124,26 @@ def _unfindable_by_value() -> Iterator[None]:
     ]
     for module in modules:
         cloudpickle.register_pickle_by_value(module)
-    copyreg.pickle(_CACHED, _cached_by_value)
+    copyreg.pickle(Cached, _cached_by_value)
     try:
         yield
     finally:
-        copyreg.dispatch_table.pop(_CACHED, None)
+        copyreg.dispatch_table.pop(Cached, None)
         for module in modules:
             cloudpickle.unregister_pickle_by_value(module)
 
 
-def _cached_by_value(function: Any) -> str | tuple[Any, ...]:
+def _cached_by_value(function: Cached[object]) -> str | tuple[Callable[..., Cached[object]], tuple[object, ...]]:
     """A function with a cache as pickles have it: by its name, or where a new process would not find that, as its code
     and an empty cache.
     """
     if function.__module__ not in {"__main__", *cloudpickle.list_registry_pickle_by_value()}:
         return str(function.__qualname__)
-    return _with_cache, (function.__wrapped__, function.cache_parameters())
+    return _with_cache, (function.__wrapped__, *function.cache_parameters().values())
 
 
-def _with_cache(function: Callable[..., Any], parameters: Mapping[str, Any]) -> Callable[..., Any]:
-    return functools.lru_cache(**parameters)(function)
+def _with_cache(function: Callable[..., object], maxsize: int | None, typed: bool) -> Cached[object]:
+    return functools.lru_cache(maxsize, typed)(function)
 
 
 def _described(value: object, seen: dict[int, tuple[int, object]]) -> Iterator[str]:
@@ -199,8 +200,10 @@ def _pickled_parts(value: Any) -> Iterator[object]:
         return
     reduced = copyreg.dispatch_table.get(type(value), lambda it: it.__reduce_ex__(4))
     try:
-        if isinstance(value, np.ndarray) or hasattr(value, "requires_grad"):  # of objects, or torch's: with addresses
-            kept: Any = (str(value.dtype), value.tolist())
+        if isinstance(value, np.ndarray):  # of objects, whose pickle has addresses
+            kept = (str(value.dtype), value.tolist())
+        elif hasattr(value, "requires_grad"):  # torch's has them too
+            kept = (str(value.dtype), value.detach().cpu().double().numpy())
         else:
             kept = reduced(value)
     except Exception:  # whatever it refuses with

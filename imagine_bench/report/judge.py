@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -22,6 +21,7 @@ from imagine_bench.judge.change import FALSE_ALARMS, LENGTH
 from imagine_bench.judge.judgement import Judgement, kept, shown
 from imagine_bench.judge.models import model_entry, runs_of
 from imagine_bench.judge.policies.acceptance import ALPHA
+from imagine_bench.judge.scores import CellScores
 from imagine_bench.recording.filmstrips import TileRow, png, transition_sheet
 from imagine_bench.registry.entries import file_name
 from imagine_bench.report.levels import LEVELS, claims_table, film_image
@@ -155,8 +155,6 @@ _MOST_SCORES = 8
 """Scores in one table: more do not fit a page of 1,200 pixels."""
 _WHY_DASH = "not offered by the model, nothing to tell apart, or judged before this score existed"
 _BY_DEPTH = {"tv": "tv_by_depth", "perfect": "perfect_by_depth", "unbiased": "unbiased_by_depth"}
-Scores = Mapping[str, Any]
-"""The kept results of a model that was fitted once."""
 
 
 @dataclass(frozen=True)
@@ -166,10 +164,10 @@ class Judged:
     folder: Path
     judgement: Judgement
     spec: TaskSpec  # the task
-    cells: dict[tuple[str, int], list[Scores]]  # one a seed, by model and transitions
+    cells: dict[tuple[str, int], list[CellScores]]  # one a seed, by model and transitions
 
     @property
-    def last(self) -> dict[str, list[Scores]]:
+    def last(self) -> dict[str, list[CellScores]]:
         """The cells at the most transitions, by model."""
         return {model: cells for (model, size), cells in self.cells.items() if size == self.judgement.sizes[-1]}
 
@@ -187,7 +185,7 @@ class Judged:
 
 def judged(folder: Path, judgement: Judgement) -> Judged:
     """A judgement with the cells that are kept in its folder. Raises ArtefactError: a file is damaged."""
-    cells: dict[tuple[str, int], list[Scores]] = {}
+    cells: dict[tuple[str, int], list[CellScores]] = {}
     for cell in kept(folder, judgement):
         cells.setdefault((cell["model"], cell["transitions"]), []).append(cell)
     return Judged(folder, judgement, registry.task(judgement.task), cells)
@@ -225,7 +223,7 @@ def _csv(found: Judged) -> str:
 # Scores ------------------------------------------------------------------------------------------------------------
 
 
-def score(cell: Scores, name: str) -> float:
+def score(cell: CellScores, name: str) -> float:
     """A score of a cell; ``tv_5`` is the total variation at depth 5. NaN where there is none."""
     kind, _, depth = name.rpartition("_")
     if kind in _BY_DEPTH and depth.isdigit():

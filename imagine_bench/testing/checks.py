@@ -9,7 +9,6 @@ import itertools
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
-from operator import itemgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -284,15 +283,10 @@ def same_state(one: AgentState, other: AgentState) -> bool:
         values = dict(state.values)
         if isinstance(values.get("meters"), dict):
             values["meters"] = {name: value for name, value in values["meters"].items() if not name.startswith("time/")}
-        kept = json.loads(json.dumps(values, default=_plain), object_pairs_hook=_in_order)
-        return json.dumps(kept)  # in which a NaN equals itself
+        kept = json.loads(json.dumps(values, default=_plain))
+        return json.dumps(kept, sort_keys=True)  # in which a NaN equals itself
 
     return untimed(one) == untimed(other) and same_arrays(one, other)
-
-
-def _in_order(pairs: list[tuple[str, object]]) -> dict[str, object]:
-    """The pairs of a mapping by name; two of one name, such as of 1 and "1", are two."""
-    return {"": sorted(pairs, key=itemgetter(0))}
 
 
 def _plain(value: object) -> object:
