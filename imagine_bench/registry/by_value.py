@@ -12,6 +12,7 @@ import dis
 import functools
 import hashlib
 import random
+import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -44,7 +45,9 @@ _ATTRIBUTES: Mapping[type, tuple[str, ...]] = {
     functools.cached_property: ("func",),
     functools.partial: ("func", "args", "keywords"),
     property: ("fget", "fset", "fdel"),
+    re.Pattern: ("pattern", "flags"),
     staticmethod: ("__func__",),
+    np.ufunc: ("__name__",),
     Cached: ("__wrapped__",),
 }
 """The attributes that decide about an object of one of Python's own types."""
@@ -177,6 +180,8 @@ def _parts(value: object) -> Iterator[object]:
         yield from (getattr(value, name) for name in attributes)
     elif isinstance(value, tuple | list):
         yield from value
+    elif isinstance(value, np.ndarray):  # of objects, whose pickle has addresses
+        yield value.tolist()
     elif isinstance(value, Mapping):
         yield from (part for item in value.items() for part in item)
     elif isinstance(value, FunctionType | type):
@@ -198,14 +203,10 @@ def _pickled_parts(value: Any) -> Iterator[object]:
     """
     if isinstance(value, _GENERATORS) or hasattr(value, "initial_seed"):
         return
-    reduced = copyreg.dispatch_table.get(type(value), lambda it: it.__reduce_ex__(4))
     try:
-        if isinstance(value, np.ndarray):  # of objects, whose pickle has addresses
-            kept = (str(value.dtype), value.tolist())
-        elif hasattr(value, "requires_grad"):  # torch's has them too
+        kept = value.__reduce_ex__(4)
+        if hasattr(value, "requires_grad"):  # torch's parts have addresses
             kept = (str(value.dtype), value.detach().cpu().double().numpy())
-        else:
-            kept = reduced(value)
     except Exception:  # whatever it refuses with
         return
     if isinstance(kept, str):  # the pickle names it

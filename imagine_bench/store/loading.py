@@ -69,7 +69,7 @@ def _kept_runs(folder: Path, whole: Protocol) -> Runs:
     rows: dict[tuple[str, int], list[Checkpoint]] = {}
     with reading(folder / _RESULTS, "the table of a bench of agents"):
         for row in table_rows((folder / _RESULTS).read_text(), ("agent", "solved")):
-            diagnostics = {name.removeprefix(_APART): float(value) for name, value in row.items() if name not in _COLUMNS}
+            diagnostics = {_name_of(name): float(value) for name, value in row.items() if name not in _COLUMNS}
             agent = agent_label(row["agent"], {"agent_names": whole.agent_names})
             checkpoint = unpack(Checkpoint, {**row, "diagnostics": diagnostics}, {})
             rows.setdefault((agent, row["seed"]), []).append(checkpoint)
@@ -112,6 +112,11 @@ def results_csv(result: BenchResult) -> str:
 def _column_of(diagnostic: str) -> str:
     """The column of a diagnostic, whatever name an agent gave it."""
     return f"{_APART}{diagnostic}" if diagnostic in _COLUMNS or diagnostic.startswith(_APART) else diagnostic
+
+
+def _name_of(column: str) -> str:
+    """The inverse of :func:`_column_of`."""
+    return column.removeprefix(_APART)
 
 
 def _largest_part(whole: Protocol, runs: Runs, folder: Path) -> BenchResult:
