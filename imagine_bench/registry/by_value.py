@@ -11,7 +11,6 @@ import copyreg
 import dis
 import functools
 import hashlib
-import random
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -51,7 +50,6 @@ _ATTRIBUTES: Mapping[type, tuple[str, ...]] = {
     Cached: ("__wrapped__",),
 }
 """The attributes that decide about an object of one of Python's own types."""
-_GENERATORS = (np.random.Generator, np.random.BitGenerator, np.random.RandomState, random.Random)
 
 
 @dataclass(frozen=True, repr=False)
@@ -201,7 +199,7 @@ def _pickled_parts(value: Any) -> Iterator[object]:
 
     Nothing of a random generator, whose state changes as it draws; numpy's, Python's or torch's.
     """
-    if isinstance(value, _GENERATORS) or hasattr(value, "initial_seed"):
+    if "random" in type(value).__module__.split(".") or hasattr(value, "initial_seed"):
         return
     try:
         kept = value.__reduce_ex__(4)

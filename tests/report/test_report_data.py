@@ -13,11 +13,13 @@ import pytest
 from fake_results import WIDE, bench_result, rewritten
 from guest_packages import Guests
 
-from imagine_bench import registry, statistics
+from imagine_bench import reference, registry, statistics
 from imagine_bench.errors import SetupError, UnknownNameError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.report.bench import bench_page, cost, gain
 from imagine_bench.report.data import (
+    DIFFERENCE,
+    SCORE,
     card_of,
     collect,
     frames_before,
@@ -83,6 +85,22 @@ def test_frames_seen_beforehand_are_those_of_the_card(result: BenchResult) -> No
         facts = {**result.environment, "encoders": offered}
         data = collect(dataclasses.replace(result, protocol=protocol, runs=runs, environment=facts))
         assert [frames_before(data, agent) for agent in agents] == [0, pytest.approx(frames, nan_ok=True)]
+
+
+def test_gains_are_of_learners_over_dqn(result: BenchResult) -> None:
+    data = collect(result)
+    trials = result.protocol.evaluation_episodes
+    learners = {agent for agent in result.protocol.agents if registry.agent_entry(agent).learns}
+    assert {record["agent"] for record in data.records if "gain" in record} == learners - {"dqn"}
+    assert {record["agent"] for record in data.records if "area" in record} == learners
+    shares, base = (result.success_rates(agent)[:, 1] for agent in ("imagination", "dqn"))
+    row = data.of("imagination")[1]
+    assert tuple(row[name] for name in DIFFERENCE) == statistics.difference(shares, base, trials=trials)
+    assert row["gain"] == pytest.approx((shares.mean() - base.mean()) / base.mean())
+    assert row["thesis_gain"] == reference.gain("arrow_puzzle", "imagination")[2000]
+    dqn = data.of("dqn")[1]
+    assert (dqn["thesis_mean"], dqn["thesis_std"]) == reference.success("arrow_puzzle", "dqn")[2000]
+    assert tuple(dqn[name] for name in SCORE) == (statistics.iqm(base), *statistics.interval(base, trials=trials))
 
 
 def test_areas_begin_at_the_chance_level(tmp_path: Path) -> None:

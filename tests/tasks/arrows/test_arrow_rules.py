@@ -25,6 +25,24 @@ def test_counts_of_macrostates():
     assert not any(map(is_random, FAMILY))
 
 
+@pytest.mark.parametrize(
+    ("rules", "chance", "optimal_return", "mean_length"),
+    [
+        (EASY, 0.04602, 48.222, 2.778),
+        (HARD, 0.03766, 47.727, 3.273),
+        (TOWARD, 0.04602, 48.222, 2.778),
+        (CLOCKWISE, 0.03766, 47.727, 3.273),
+    ],
+    ids=NAMES,
+)
+def test_facts_of_the_digest(rules, chance, optimal_return, mean_length):
+    known = facts(rules, 10)
+    assert known.chance_level == pytest.approx(chance, abs=5e-6)
+    assert known.optimum == pytest.approx(1.0, abs=1e-12)
+    assert known.optimal_return == pytest.approx(optimal_return, abs=5e-4)
+    assert known.mean_plan_length == pytest.approx(mean_length, abs=5e-4)
+
+
 class _Endless:
     n_actions, states, start_states = 1, ((0,),), ((0,),)
 

@@ -311,8 +311,11 @@ class CueEncoder(FakeEncoder):
 def test_a_read_out_finds_what_the_first_frame_said() -> None:
     agent = make("drqn", **{"recurrence.units": 32, "controller.updates_per_step": 0})
     agent.perception.plain.encoder = CueEncoder()
-    recall(agent, range(60), np.random.default_rng(4))
+    rng = np.random.default_rng(4)
     blank = frame(0)
+    recall(agent, range(1), rng)
+    agent.read_memory(blank, (ACTIONS,))  # which is made anew after more steps
+    recall(agent, range(1, 60), rng)
     for cue in range(ACTIONS):
         agent.begin_episode()
         for shown in (frame(1 + cue), blank):
