@@ -211,3 +211,11 @@ def test_missing_dm_control_is_one_clear_error():
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60).stdout
     assert "dm_control is not installed" in said and "Python 3.11 or 3.12" in said
+
+
+def test_an_end_at_the_time_limit_is_an_end():
+    env = as_dm_env(registry.TASKS["arrow_puzzle"].env_id, seed=0, execution="kinematic", max_episode_steps=3)
+    env.reset()
+    *_, last = (env.step(action) for action in (1, 5, 3))
+    assert (last.last(), last.reward, last.discount) == (True, 50.0, 0.0)
+    env.close()

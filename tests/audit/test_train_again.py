@@ -234,6 +234,15 @@ def test_what_a_replay_cannot_show_training_again_does(pair: Path, tmp_path: Pat
         assert found in trained(pair, tmp_path / str(number), *forge)
 
 
+def test_cpu_seconds_that_are_far_too_small_are_found(
+    pair: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without the second that a run may always take more."""
+    monkeypatch.setattr("imagine_bench.running.retraining.SAME_COST", (4.0, 0.0))
+    less = in_runs(lambda run: [row.update(train_cpu_s=1e-6 * row["train_cpu_s"]) for row in run.rows])
+    assert "0.0 CPU s of training were kept" in trained(pair, tmp_path, less)
+
+
 def test_what_was_made_on_another_processor_holds_in_part(pair: Path, tmp_path: Path) -> None:
     """Begun here, resumed on another processor, and ended here, with other weights in the end."""
     session = {"changed": {"cpu": ["this", "another"]}, "wall_s": 0.0}

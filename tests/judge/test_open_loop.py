@@ -183,6 +183,17 @@ def test_reality_goes_as_was_imagined_where_it_may() -> None:
     assert reached(IMPOSSIBLE, 30) == {outcome.macrostate for outcome in PICK_PLACE.rules.outcomes(START, 0)}
 
 
+def test_reality_goes_as_was_imagined_late_where_frames_are_late() -> None:
+    late = labelled("pick_place:lag=1")
+    frame = np.zeros((64, 64, 3), dtype=np.uint8)
+    moment = Moment(spec=late, appearance="clean", frame=frame, macrostate=START)
+    for wish in (ASKS_MIDDLE, ASKS_RIGHT):
+        for rng in map(np.random.default_rng, range(10)):
+            rollout = IMAGINER.imagine(frame, actions=np.zeros(2, dtype=np.int64), depth=9, rng=rng)
+            real = moment.beside(dataclasses.replace(rollout, macrostates=np.array([START, wish])), rng)
+            assert real.real_macrostates.tolist() == [list(START), list(wish)]
+
+
 def test_only_a_task_with_chance_has_sampled_rollouts() -> None:
     none, sampled = (
         imagine_sampled_rollouts(IMAGINER, spec, appearance="clean", seeds=SeedTree(0)) for spec in (PUZZLE, PICK_PLACE)

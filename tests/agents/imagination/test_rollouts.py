@@ -124,7 +124,8 @@ def test_a_single_weight_sample_cannot_be_compared() -> None:
 
 
 @pytest.mark.parametrize(
-    ("exploration", "epsilon", "least", "most"), [(0.0, 0.0, 0.0, 0.0), (0.5, 0.0, 0.1, 0.4), (0.0, 1.0, 0.3, 0.7)]
+    ("exploration", "epsilon", "least", "most"),
+    [(0.0, 0.0, 0.0, 0.0), (0.5, 0.0, 0.1, 0.4), (0.0, 1.0, 0.3, 0.7), (0.2, 1.0, 0.3, 0.7)],
 )
 def test_rollouts_explore_at_least_as_the_settings_say(
     exploration: float, epsilon: float, least: float, most: float

@@ -6,6 +6,7 @@ import mink
 import mujoco
 import numpy as np
 import pytest
+from imagine_bench.tasks.continuous.controls import HandControl
 from imagine_bench.tasks.continuous.differential import DifferentialIK
 from imagine_bench.tasks.motion.arm_model import ArmModel
 from imagine_bench.tasks.scenes.arm import ARM_JOINTS, JOINT_SPEED_LIMITS_RAD_S, TCP_SITE
@@ -86,3 +87,19 @@ def test_a_step_within_limits_misses_the_motion_by_least_squares(share: float) -
         assert limited == (missed_m > 2e-3)
         held_up.append(limited)
     assert np.mean(held_up) > 0.5 if share == 1.0 else np.mean(held_up) < 0.5
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_a_hand_that_is_asked_for_a_pose_turns_about_axes_of_the_world(axis: int) -> None:
+    """From a hand that is tipped over: of one that points down, the rotation is its own inverse."""
+    control = HandControl("pose", ArmModel(), PERIOD_S)
+    joints_rad = np.array(OBSERVATION_QPOS_RAD) + np.array([0.0, 0.0, 0.0, 0.0, 0.3, 0.6, 0.0])
+    place_m, rotation = control.hand_pose(joints_rad)
+    wanted = mink.SO3.exp(0.2 * np.eye(3)[axis]).as_matrix() @ rotation
+    quat = mink.SO3.from_matrix(wanted).wxyz
+    action = control.checked(np.array([*place_m, *quat, 1.0]))
+    for _ in range(25):
+        joints_rad = control.command(action, joints_rad, 0.0).joints_rad
+    reached_m, reached = control.hand_pose(joints_rad)
+    assert np.abs(reached - wanted).max() < 1e-3
+    assert np.abs(reached_m - place_m).max() < 1e-3

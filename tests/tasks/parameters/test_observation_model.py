@@ -47,6 +47,15 @@ def test_frames_tell_nothing_of_a_hidden_gesture(appearance):
     assert (shown != hidden).any(axis=-1).sum() > 50
 
 
+def test_the_light_of_a_hidden_gesture_does_not_depend_on_the_row_before():
+    spec = registry.task("arrows:gesture=0.5")
+    rows = np.array([(0, 1, 2, -1), (0, 1, 2, 0), (0, 1, 2, -1)])
+    again = spec.render_macrostates(rows[:1], "patched", np.random.default_rng(5))
+    for before in rows[:2]:
+        spec.render_macrostates(before[None], "patched", np.random.default_rng(1))
+        np.testing.assert_array_equal(spec.render_macrostates(rows[2:], "patched", np.random.default_rng(5)), again)
+
+
 @pytest.mark.parametrize("id_", IDS)
 def test_a_gesture_is_seen_as_often_as_said(id_):
     """By the one-hot gesture: always, at first only, or within 3.5 standard deviations of a probability."""

@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 from imagine_bench.tasks.scenes.appearance import LEVELS, NUISANCE_FIELDS, appearance, appearance_arrays, between
+from imagine_bench.tasks.scenes.nuisances import draw_nuisance
 from whole_outputs import tabulated
 
 from imagine_bench.appearance import FACTORS, NUISANCES, POINTS, appearance_name
@@ -127,3 +128,18 @@ def drawn(task, given, size):
 def test_all_that_an_appearance_varies_and_by_how_much(expected):
     rows = [drawn(*each) for each in DRAWN]
     expected("appearances", tabulated([rows[0], *(row.values() for row in rows)]), exactly=False)
+
+
+def test_a_shadow_goes_on_and_turns_back_at_the_borders():
+    """It moves by at most a quarter of the frame's edge along each axis."""
+    white = np.full((64, 64, 3), 255, np.uint8)
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        nuisance = draw_nuisance(appearance("shadow=1"), rng)
+        places = []
+        for _ in range(30):
+            places.append(np.unravel_index(nuisance.of(white).sum(axis=2).argmin(), (64, 64)))
+            nuisance = nuisance.following(rng)
+        moved = np.abs(np.diff(np.array(places), axis=0))
+        assert moved.max() <= 17
+        assert moved.sum(axis=0).min() > 64, "it came to a border"
