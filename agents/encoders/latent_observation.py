@@ -30,10 +30,9 @@ class LatentObservation(gymnasium.ObservationWrapper[Floats32, Action, Frame]):
 
     def __init__(self, env: gymnasium.Env[Frame, Action], encoder: Encoder | Path | str) -> None:
         super().__init__(env)
-        seen = env.observation_space
-        if seen.shape != (FRAME_PX, FRAME_PX, 3) or seen.dtype != np.uint8:
+        if env.observation_space.shape != (FRAME_PX, FRAME_PX, 3):
             raise InvalidValueError(
-                f"The environment gives {seen}; an encoder takes frames of {FRAME_PX} x {FRAME_PX} pixels alone. Leave "
+                f"The environment gives {env.observation_space}; an encoder takes frames of 64 x 64 pixels. Leave "
                 "observation and size as they are by default."
             )
         self.encoder = encoder if isinstance(encoder, Encoder) else Encoder.load(_path(encoder))

@@ -86,7 +86,7 @@ def q_table(names: Sequence[str], values: NDArray[np.float32], chosen: int) -> s
     room = round(-low * cells_per_unit)
     width = max(len(name) for name in names)
     rows = []
-    lengths = abs(np.nan_to_num(values.astype(np.float64), posinf=high, neginf=low))
+    lengths = abs(np.nan_to_num(values, posinf=high, neginf=low))
     for index, (name, value, length) in enumerate(zip(names, values, lengths.tolist(), strict=True)):
         bar = "█" * round(length * cells_per_unit)
         below, above = (bar, "") if value < 0 else ("", bar)

@@ -59,8 +59,7 @@ class CodeByValue:
     name: str  #: its qualified name
     pickled: bytes = field(compare=False)  #: the bytes of :mod:`cloudpickle`, each time others
     digest: str  #: twelve hex digits, see :func:`code_digest`
-    module: str = field(default="", compare=False)  #: its module where that is of an installed package
-    home: str = field(default="", compare=False)  #: its module, whichever that is
+    module: str = field(compare=False)  #: its module
 
     @classmethod
     def of(cls, target: Callable[..., Any]) -> CodeByValue:
@@ -81,8 +80,7 @@ class CodeByValue:
                 f"{name} cannot be sent to worker processes ({type(error).__name__}: {why}). Let it make such objects "
                 "itself, in its constructor, and keep them out of variables around it."
             ) from error
-        module = str(getattr(target, "__module__", ""))
-        return cls(name, pickled, code_digest(target), module if _is_of_package(module) else "", module)
+        return cls(name, pickled, code_digest(target), str(getattr(target, "__module__", "")))
 
     def __str__(self) -> str:
         return f"the code of {self.name}"
@@ -140,18 +138,14 @@ def _cached_by_value(function: Cached[object]) -> str | tuple[Callable[..., Cach
     """
     if function.__module__ not in {"__main__", *cloudpickle.list_registry_pickle_by_value()}:
         return str(function.__qualname__)
-    return _with_cache, (function.__wrapped__, *function.cache_parameters().values())
-
-
-def _with_cache(function: Callable[..., object], maxsize: int | None, typed: bool) -> Cached[object]:
-    return functools.lru_cache(maxsize, typed)(function)
+    return functools.lru_cache(**function.cache_parameters()), (function.__wrapped__,)
 
 
 def _described(value: object, seen: dict[int, tuple[int, object]]) -> Iterator[str]:
     """A value as lines of text that are the same in every process; ``seen`` are the objects so far, each with its place
     among them.
     """
-    if value is None or isinstance(value, bool | int | float | complex | str | bytes):
+    if value is None or isinstance(value, int | float | complex | str | bytes):
         yield repr(value)
         return
     if isinstance(value, np.ndarray) and not value.dtype.hasobject:
@@ -199,7 +193,7 @@ def _pickled_parts(value: Any) -> Iterator[object]:
 
     Nothing of a random generator, whose state changes as it draws; numpy's, Python's or torch's.
     """
-    if "random" in type(value).__module__.split(".") or hasattr(value, "initial_seed"):
+    if "random" in type(value).__module__ or hasattr(value, "initial_seed"):
         return
     try:
         kept = value.__reduce_ex__(4)
@@ -263,10 +257,10 @@ def _is_installed(module: str | None) -> bool:
     if module is None or module == "__main__":
         return False
     top = module.partition(".")[0]
-    return top == "imagine_bench" or top in sys.stdlib_module_names or _is_of_package(module)
+    return top == "imagine_bench" or top in sys.stdlib_module_names or is_of_package(module)
 
 
-def _is_of_package(module: str) -> bool:
+def is_of_package(module: str) -> bool:
     """Whether a module lies where packages are installed."""
     file = getattr(sys.modules.get(module), "__file__", None)
     return file is not None and any(folder in Path(file).parts for folder in _INSTALLED)

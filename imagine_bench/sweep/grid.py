@@ -13,7 +13,6 @@ import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -218,8 +217,8 @@ def read_grid(path: Path) -> Study | Suite:
         )
     try:
         text = path.read_text()
-        read = partial(json.loads, object_pairs_hook=each_once) if path.suffix == ".json" else tomllib.loads
-        data = {"name": path.stem, **read(text)}
+        found = json.loads(text, object_pairs_hook=each_once) if path.suffix == ".json" else tomllib.loads(text)
+        data = {"name": path.stem, **found}
         if "experiments" not in data:
             variants = [Variant(**{**each, "settings": _settings(each)}) for each in data["variants"]]
             return Study(**{**data, "variants": variants})
