@@ -361,7 +361,7 @@ def _name(agent: str | MakeAgent) -> str:
     code = CodeByValue.of(agent)
     made_by = {name: entry.make for name, entry in registry.AGENTS.items() if isinstance(entry.make, CodeByValue)}
     same = [name for name, make in made_by.items() if make == code]
-    former = [name for name, make in made_by.items() if (make.module, make.name) == (code.module, code.name)]
+    former = [name for name, make in made_by.items() if (make.home, make.name) == (code.home, code.name)]
     for name in same or (former if len(former) == 1 else ()):
         registry.AGENTS[name] = dataclasses.replace(registry.AGENTS[name], make=code)
         return name

@@ -32,8 +32,8 @@ class LatentObservation(gymnasium.ObservationWrapper[Floats32, Action, Frame]):
         super().__init__(env)
         if env.observation_space.shape != (FRAME_PX, FRAME_PX, 3):
             raise InvalidValueError(
-                f"The environment gives {env.observation_space}; an encoder takes frames of 64 x 64 pixels. Leave "
-                "observation and size as they are by default."
+                f"The environment gives {env.observation_space}; an encoder takes frames of {FRAME_PX} x {FRAME_PX} "
+                "pixels. Leave observation and size as they are by default."
             )
         self.encoder = encoder if isinstance(encoder, Encoder) else Encoder.load(_path(encoder))
         reads = self.encoder.card.preprocessing

@@ -140,7 +140,7 @@ def _require_judged(spec: TaskSpec) -> None:
     """Raise InvalidValueError for a task in which no model can be judged."""
     if _EXECUTION not in spec.executions:
         raise InvalidValueError(
-            f"The data of a judgement are collected in the {_EXECUTION} execution, which task {spec.id!r} has not. "
+            f"The data of a judgement are collected in the {_EXECUTION} execution, which task {spec.id!r} lacks. "
             "Judge another task."
         )
     if spec.sight is not None:

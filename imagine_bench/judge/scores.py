@@ -60,7 +60,7 @@ FORMER = {
 """Today's name of each score that files kept before 2026-11-30 name otherwise."""
 Scores = dict[str, float]
 CellScores = dict[str, Any]
-"""Everything that is kept of one model, seed and size of data, as JSON has it."""
+"""Scores of one model, seed and size of data with everything else that is kept beside them, or a part, as in JSON."""
 T = TypeVar("T")
 Pairs = Sequence[tuple[Mapping[Value, float], Mapping[Value, float]]]
 """Exact and imagined probabilities of each question."""

@@ -45,7 +45,7 @@ from imagine_bench.registry import (
     task_entry,
 )
 from imagine_bench.registry import task_name as canonical
-from imagine_bench.registry.by_value import CodeByValue, is_of_package
+from imagine_bench.registry.by_value import CodeByValue
 from imagine_bench.registry.entries import parse_configuration
 from imagine_bench.rules import facts
 from imagine_bench.seeding import SeedTree
@@ -369,9 +369,7 @@ def registered_code(agents: Iterable[str]) -> tuple[tuple[str, str], ...]:
 
 def _digest(make: CodeByValue | str) -> str:
     """The digest of an agent's code: of a class of an installed package, of the class and of that package."""
-    if isinstance(make, str):
-        return package_code(make)
-    return make.digest + package_code(make.module) if is_of_package(make.module) else make.digest
+    return package_code(make) if isinstance(make, str) else make.digest + (make.module and package_code(make.module))
 
 
 def _require_same_code(agent: str, protocol: Protocol) -> None:

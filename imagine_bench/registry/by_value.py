@@ -26,6 +26,7 @@ import numpy as np
 
 from imagine_bench.errors import InvalidValueError, SetupError, brief, plain
 
+_ADDRESS = re.compile(r" at 0x[0-9a-f]+", re.IGNORECASE)
 _INSTALLED = ("site-packages", "dist-packages")
 _NO_CODE = frozenset(
     (
@@ -34,7 +35,7 @@ _NO_CODE = frozenset(
     )
 )
 """Attributes of a class that Python itself adds, or that change nothing that it does."""
-Cached = functools._lru_cache_wrapper
+_Cached = functools._lru_cache_wrapper
 """A function that remembers its results."""
 _ATTRIBUTES: Mapping[type, tuple[str, ...]] = {
     CodeType: ("co_code", "co_consts", "co_names", "co_varnames", "co_freevars"),
@@ -44,10 +45,8 @@ _ATTRIBUTES: Mapping[type, tuple[str, ...]] = {
     functools.cached_property: ("func",),
     functools.partial: ("func", "args", "keywords"),
     property: ("fget", "fset", "fdel"),
-    re.Pattern: ("pattern", "flags"),
     staticmethod: ("__func__",),
-    np.ufunc: ("__name__",),
-    Cached: ("__wrapped__",),
+    _Cached: ("__wrapped__",),
 }
 """The attributes that decide about an object of one of Python's own types."""
 
@@ -59,7 +58,8 @@ class CodeByValue:
     name: str  #: its qualified name
     pickled: bytes = field(compare=False)  #: the bytes of :mod:`cloudpickle`, each time others
     digest: str  #: twelve hex digits, see :func:`code_digest`
-    module: str = field(compare=False)  #: its module
+    module: str = field(default="", compare=False)  #: its module where that is of an installed package
+    home: str = field(default="", compare=False)  #: its module, whichever that is
 
     @classmethod
     def of(cls, target: Callable[..., Any]) -> CodeByValue:
@@ -74,13 +74,15 @@ class CodeByValue:
         try:
             with _unfindable_by_value():
                 pickled = cloudpickle.dumps(target)
+            digest = code_digest(target)
         except Exception as error:  # whatever the pickling of somebody's object raises
             why = plain(error).partition("\n")[0]
             raise InvalidValueError(
                 f"{name} cannot be sent to worker processes ({type(error).__name__}: {why}). Let it make such objects "
                 "itself, in its constructor, and keep them out of variables around it."
             ) from error
-        return cls(name, pickled, code_digest(target), str(getattr(target, "__module__", "")))
+        module = str(getattr(target, "__module__", ""))
+        return cls(name, pickled, digest, module if _is_of_package(module) else "", module)
 
     def __str__(self) -> str:
         return f"the code of {self.name}"
@@ -123,21 +125,23 @@ def _unfindable_by_value() -> Iterator[None]:
     ]
     for module in modules:
         cloudpickle.register_pickle_by_value(module)
-    copyreg.pickle(Cached, _cached_by_value)
+    copyreg.pickle(_Cached, _cached_by_value)
     try:
         yield
     finally:
-        copyreg.dispatch_table.pop(Cached, None)
+        copyreg.dispatch_table.pop(_Cached, None)
         for module in modules:
             cloudpickle.unregister_pickle_by_value(module)
 
 
-def _cached_by_value(function: Cached[object]) -> str | tuple[Callable[..., Cached[object]], tuple[object, ...]]:
-    """A function with a cache as pickles have it: by its name, or where a new process would not find that, as its code
-    and an empty cache.
+def _cached_by_value(function: _Cached[object]) -> str | tuple[Callable[..., _Cached[object]], tuple[object, ...]]:
+    """A function with a cache as pickles have it: by its name, or where a new process would not find it by that, as its
+    code and an empty cache.
     """
-    if function.__module__ not in {"__main__", *cloudpickle.list_registry_pickle_by_value()}:
-        return str(function.__qualname__)
+    name = getattr(function, "__qualname__", "")
+    is_sent = function.__module__ in {"__main__", *cloudpickle.list_registry_pickle_by_value()}
+    if not is_sent and getattr(sys.modules.get(function.__module__), name, None) is function:
+        return name
     return functools.lru_cache(**function.cache_parameters()), (function.__wrapped__,)
 
 
@@ -172,8 +176,6 @@ def _parts(value: object) -> Iterator[object]:
         yield from (getattr(value, name) for name in attributes)
     elif isinstance(value, tuple | list):
         yield from value
-    elif isinstance(value, np.ndarray):  # of objects, whose pickle has addresses
-        yield value.tolist()
     elif isinstance(value, Mapping):
         yield from (part for item in value.items() for part in item)
     elif isinstance(value, FunctionType | type):
@@ -184,27 +186,8 @@ def _parts(value: object) -> Iterator[object]:
     elif isinstance(value, SimpleNamespace) or (not _is_known(type(value)) and hasattr(value, "__dict__")):
         yield type(value)
         yield dict(sorted(vars(value).items()))
-    else:
-        yield from _pickled_parts(value)
-
-
-def _pickled_parts(value: Any) -> Iterator[object]:
-    """The parts that a pickle keeps of an object of any other type; of one that has none, such as a lock, nothing.
-
-    Nothing of a random generator, whose state changes as it draws; numpy's, Python's or torch's.
-    """
-    if "random" in type(value).__module__ or hasattr(value, "initial_seed"):
-        return
-    try:
-        kept = value.__reduce_ex__(4)
-        if hasattr(value, "requires_grad"):  # torch's parts have addresses
-            kept = (str(value.dtype), value.detach().cpu().double().numpy())
-    except Exception:  # whatever it refuses with
-        return
-    if isinstance(kept, str):  # the pickle names it
-        yield f"{getattr(value, '__module__', None)}:{kept}"
-    else:
-        yield from (list(part) if isinstance(part, Iterator) else part for part in kept)
+    elif not isinstance(value, Iterator):  # which goes on as it is used
+        yield _ADDRESS.sub("", repr(value))
 
 
 def _parts_of_class(value: type) -> Iterator[object]:
@@ -257,10 +240,10 @@ def _is_installed(module: str | None) -> bool:
     if module is None or module == "__main__":
         return False
     top = module.partition(".")[0]
-    return top == "imagine_bench" or top in sys.stdlib_module_names or is_of_package(module)
+    return top == "imagine_bench" or top in sys.stdlib_module_names or _is_of_package(module)
 
 
-def is_of_package(module: str) -> bool:
+def _is_of_package(module: str) -> bool:
     """Whether a module lies where packages are installed."""
     file = getattr(sys.modules.get(module), "__file__", None)
     return file is not None and any(folder in Path(file).parts for folder in _INSTALLED)

@@ -246,7 +246,7 @@ def train_externally(run: Run, agent: ExternalTrainer, test_at: Callable[[int], 
     if run.counters.episode < budgets[-1]:
         raise InvalidValueError(
             f"The training loop of agent {run.spec.agent!r} ended after {run.counters.episode:,} of {budgets[-1]:,} "
-            "episodes; it goes on until on_episode() answers False."
+            "episodes; it must go on until on_episode() answers False."
         )
 
 

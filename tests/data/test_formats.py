@@ -225,3 +225,12 @@ def test_large_sets_lie_in_several_files(tmp_path: Path, monkeypatch: pytest.Mon
         places.add(place)
     assert len(places) > 2 and max(places)[0] > 0 and max(file for _, file in places) == 1
     assert read_dataset(tmp_path / "set").episodes.hash == collected()[0].hash
+
+
+def test_nothing_a_learner_reads_holds_macrostates(tmp_path: Path) -> None:
+    for format in FORMATS:
+        written(tmp_path / format, format)
+    assert set(np.load(tmp_path / "npz/episodes.npz").files) == {field.name for field in dataclasses.fields(Episodes)}
+    assert not [name for name in pq.read_table(tmp_path / "lerobot" / _DATA).schema.names if "state" in name]
+    (data,) = (tmp_path / "minari").glob("*/data")
+    assert set(next(iter(minari.MinariDataset(data))).infos) == {"action_mask", "is_success"}

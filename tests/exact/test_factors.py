@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from machines import Wheels, spec_of
 from scipy import stats
 
+from imagine_bench.exact import learner
 from imagine_bench.exact.certificate import certificate, certificate_rows
 from imagine_bench.exact.factors import factor_graph, machine
 from imagine_bench.exact.learner import learn
@@ -104,3 +106,17 @@ def test_a_world_without_a_plan_says_so():
     found = certificate(spec_of(Hopeless(n=2), 5))
     assert found.learning_cost is None and found.optimum == 0.0
     assert certificate_rows(found)["shortest plans"] == "none; none from 18 starts"
+
+
+def test_a_learner_looks_no_further_than_its_episode_goes_on(monkeypatch):
+    full, left = machine(Wheels(n=2)), []
+    choose = learner.CautiousLearner.choose
+
+    def look(self, row, most, rng):
+        left.append(most)
+        return choose(self, row, most, rng)
+
+    monkeypatch.setattr(learner.CautiousLearner, "choose", look)
+    run = learner.learn(full, factor_graph(full), 3, np.random.default_rng(0))
+    assert len(left) == run.transitions and left.count(3) == run.episodes
+    assert all(later in {now - 1, 3} for now, later in pairwise(left)) and min(left) == 1

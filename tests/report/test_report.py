@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
+import io
 import math
 import re
 from pathlib import Path
@@ -19,7 +21,7 @@ from imagine_bench.protocols.control import Protocol
 from imagine_bench.registry.entries import FIRST, TODAY
 from imagine_bench.report import bench_page, write_report
 from imagine_bench.report.bench import shown, verdict
-from imagine_bench.report.data import collect
+from imagine_bench.report.data import DIFFERENCE, SCORE, collect
 from imagine_bench.report.page import Page, Table, number
 from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
 
@@ -214,3 +216,11 @@ def test_the_page_can_be_read_alone_and_shows_every_figure(folder: Path) -> None
     assert {"success.png", "open_loop.png", "rollout_imagination_1.png"} <= pictures
     assert len(pictures) == text.count("<img")
     assert all((folder / picture).read_bytes().startswith(b"\x89PNG") for picture in pictures)
+
+
+def test_three_seeds_are_too_few_to_say_whatever_they_solve(result: BenchResult) -> None:
+    page = bench_page(shifted(result, dqn=[100, 102, 104], imagination=[198, 199, 200]))
+    assert table(page, "gains").caption.startswith("Too few seeds to say")
+    rows = list(csv.DictReader(io.StringIO(page.files["summary.csv"])))
+    assert {row["interval_over"] for row in rows} == {"too few seeds"}
+    assert all(row[name] in ("", "nan") for row in rows for name in (*SCORE[1:], *DIFFERENCE[1:], "p_holm"))

@@ -30,7 +30,6 @@ from imagine_bench.values import Json
 _HOLD = """
 import sys, time
 from pathlib import Path
-from typing import Any
 from imagine_bench.store.files import lock
 with lock(Path(sys.argv[1]), "The folder"):
     print("held", flush=True)

@@ -72,7 +72,7 @@ def test_an_encoder_of_other_preprocessing_is_refused(wrapped: bool) -> None:
 @pytest.mark.parametrize("seen", [{"observation": "frame,state"}, {"observation": "state"}, {"size": 96}])
 def test_latents_of_other_observations_than_frames_are_refused(seen: dict[str, Any]) -> None:
     with closing(gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic", **seen)) as env:
-        with pytest.raises(InvalidValueError, match="an encoder takes frames of 64 x 64 pixels alone"):
+        with pytest.raises(InvalidValueError, match="an encoder takes frames of 64 x 64 pixels"):
             LatentObservation(env, "arrow_puzzle-clean")
 
 

@@ -182,7 +182,7 @@ def test_nonsense_is_refused(runs: dict[str, Path]) -> None:
     nonsense: tuple[tuple[str, dict[str, Any]], ...] = (
         ("ascending numbers", {"sizes": (30, 20)}),
         ("hide or delay a part .* without the parameters", {"task": "arrows:cubes=2,lag=1"}),
-        ("the kinematic execution, which task 'arrow_puzzle_cloned' has not", {"task": "arrow_puzzle_cloned"}),
+        ("the kinematic execution, which task 'arrow_puzzle_cloned' lacks", {"task": "arrow_puzzle_cloned"}),
         (
             r"No model of \('copy', 'structured'\) reads latents",
             {"models": ("copy", "structured"), "encoder": _LATENTS},
