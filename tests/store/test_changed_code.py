@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import random
+import sys
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -20,9 +21,10 @@ from imagine_bench.errors import ArtefactError
 from imagine_bench.judge.judgement import Judgement
 from imagine_bench.judge.verify import verify_runs
 from imagine_bench.protocols import data
-from imagine_bench.protocols.control import protocol
+from imagine_bench.protocols.control import protocol, registered_code
 from imagine_bench.registry.builtin import OUR_AGENTS
 from imagine_bench.registry.by_value import CodeByValue, code_digest
+from imagine_bench.registry.entries import AgentEntry
 from imagine_bench.regression.protocol import plan as plan_regression
 from imagine_bench.running.trained import load_trained
 from imagine_bench.store.bench_folder import read_control
@@ -195,3 +197,19 @@ def test_studies_tasks_and_regressors_notice_changed_code(
     edit(line)
     wanted.append(plan_regression("toy_regression", "smoke", agents=("line",))[0])
     assert wanted[0].hash != wanted[1].hash
+
+
+def test_a_process_that_has_not_imported_an_agents_package_finds_the_same_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a new worker process, which is given the class by its name."""
+    package = tmp_path / "site-packages"
+    package.mkdir()
+    (package / "packaged_agent.py").write_text("class Mine:\n    pass\n")
+    monkeypatch.syspath_prepend(str(package))
+    make = CodeByValue.of(import_module("packaged_agent").Mine)
+    monkeypatch.setitem(registry.AGENTS, "mine", AgentEntry(make=make, needs_encoder=False))
+    here = registered_code(["mine"])
+    monkeypatch.delitem(sys.modules, "packaged_agent")
+    assert registered_code(["mine"]) == here
+    assert here != (("mine", make.digest),), "the files of the package count, too"
