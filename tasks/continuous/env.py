@@ -303,9 +303,7 @@ class MotionEnv(SceneEnv):
         self.data.ctrl[self.columns.ctrl] = before + change
 
     def observe(self, envs: Sequence[MotionEnv]) -> list[Observed]:
-        """The observations of :meth:`reset` and :meth:`step` for environments like this, by its cameras; once a
-        moment.
-        """
+        """Observations of :meth:`reset` and :meth:`step` of environments like this, by its cameras; once a moment."""
         now = self._observer.observe([(env._observer, env.world.observed(env.episode.macrostate)) for env in envs])
         for env, seen in zip(envs, now, strict=True):
             episode = env.episode
