@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import itertools
 import os
 import pickle
 import subprocess
@@ -131,13 +132,16 @@ def quiet_plan(rules, state, length, rng):
 def test_each_lane_goes_its_own_pace_and_sees_what_it_would_alone():
     rules, rng = registry.task("arrow_puzzle").rules, np.random.default_rng(5)
     plans = [quiet_plan(rules, START, 3, rng) for _ in range(N_LANES)]
+    steps = [list(itertools.accumulate(plan, lambda *pair: rules.outcomes(*pair)[0].macrostate, initial=START))
+             for plan in plans]  # fmt: skip
     vector = make(autoreset_mode="Disabled")
     seen = [[frame] for frame in vector.reset(seed=7, options={"macrostate": START})[0]]
     vector.send([plan[0] for plan in plans])
     for n in (2, 2, 1, 2, 1, 1):
         frames, *_, infos = vector.recv(n)
         lanes = infos["env_id"].tolist()
-        assert infos["macrostate"].shape == (n, 4) and infos["_macrostate"].all()
+        told = [tuple(state) for state in infos["macrostate"].tolist()]
+        assert told == [steps[lane][len(seen[lane])] for lane in lanes] and infos["_macrostate"].all()
         for lane, frame in zip(lanes, frames, strict=True):
             seen[lane].append(frame)
         going = [lane for lane in lanes if len(seen[lane]) <= 3]
@@ -301,6 +305,11 @@ def test_a_reset_forgets_what_a_lane_was_doing():
     again, _ = vector.reset(seed=4)
     assert len(ended) == 2 and np.array_equal(first, again)
     assert np.array_equal(vector.step(np.array([0, 2]))[0], expected)
+    vector.reset(seed=4)
+    vector.send([0, 2])
+    vector.reset(options={"reset_mask": np.array([True, False])})
+    seen, *_, infos = vector.recv()
+    assert infos["env_id"].tolist() == [1] and np.array_equal(seen, expected[1:]), "the other lane goes on"
     vector.close()
 
 
