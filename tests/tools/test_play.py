@@ -196,6 +196,25 @@ def test_who_comes_back_is_told_how_many_moves_are_left(tmp_path):
     np.testing.assert_array_equal(back, left)
 
 
+def test_only_a_success_counts_as_solved(hand):
+    """An episode can also be lost before its time is over: by hand, where a cube has fallen."""
+    game = game_of(execution="kinematic")
+    for action in (2, 0, 2):
+        game.reset(options={"macrostate": (3, 1, 2, 0)})
+        until_done(game, action)
+    assert game.summary().startswith("Solved 1 of 3 episodes (33.3%, 95 % interval 6.1% to 79.2%); chance 4.6%")
+    game.close()
+    scene = hand.env.unwrapped
+    row = scene.world.object_qpos[0]
+    for sinks_m in (0.2, 0.0, 0.2):
+        hand.reset(options={"macrostate": (1, 0)})
+        scene.data.qpos[row[3:]] = (1, 0, 0, 0)
+        scene.data.qpos[row[2]] -= sinks_m
+        while not any(hand.step(np.zeros(7, np.float32))[2:4]):
+            pass
+    assert hand.summary().startswith("Solved 1 of 3 episodes")
+
+
 class Bare(gymnasium.Wrapper):
     """A task by the contract alone, and no more: no scene to look at."""
 
