@@ -21,6 +21,7 @@ from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import InvalidValueError, SetupError
 from imagine_bench.running.player import played_run, protocol_of_player
+from imagine_bench.seeding import episode_seed
 from imagine_bench.tools import play as module
 from imagine_bench.tools.play import KEYS, KeyboardGame, film, play
 
@@ -90,6 +91,9 @@ def test_the_model_imagines_from_the_first_frame_by_the_same_keys():
     np.testing.assert_array_equal(panel(sees), seen[-1][0])
     assert not np.array_equal(imagines[240:], blank[240:]), "words about its predictions"
     assert game.summary().endswith("\nThe model foresaw 1 of 2 macrostates.")
+    frame, _ = game.reset()
+    until_done(game, 4)
+    assert asked[2:] == [([4], frame.tobytes(), asked[0][2])], "another episode is imagined from its own first frame"
     game.close()
 
 
@@ -307,14 +311,23 @@ def test_continuous_control_is_told_which_options_it_does_not_take(option, capsy
     assert f"{option.split()[0]} goes with a task of macro-actions" in capsys.readouterr().err
 
 
-@pytest.mark.slow
-def test_a_film_reaches_the_goal_and_is_never_overwritten(tmp_path):
-    out = film("arrow_puzzle", tmp_path / "new" / "turn.gif", seed=0)
+def test_a_film_lasts_as_long_as_its_motions_and_is_never_overwritten(tmp_path):
+    """At ten images a second; 0.8 s before and after each macro-action, 5 s more at the end, where the goal is reached."""
+    out = film("arrow_puzzle_easy", tmp_path / "new" / "turn.gif", seed=1)
     with Image.open(out) as gif:
-        pictures = np.stack([np.float32(picture.convert("L")) for picture in ImageSequence.Iterator(gif)])
-    assert len(pictures) > 20 and pictures.shape[1:] == (568, 924)
+        shown = [(np.float32(each.convert("L")), each.info["duration"]) for each in ImageSequence.Iterator(gif)]
+    pictures = np.stack([picture for picture, _ in shown])
+    images, over = 8 + 50 - 1, False
+    with contextlib.closing(gymnasium.make("imagine_bench/ArrowPuzzleEasy-v0", motion_hz=10.0)) as env:
+        _, info = env.reset(seed=episode_seed("recording", 1, 0))
+        while not over:
+            action = registry.task("arrow_puzzle_easy").rules.optimal_action(info["macrostate"])
+            *_, over, _, info = env.step(action)
+            images += len(env.unwrapped.arm_motion().time_s) + 1 + 8
+    assert info["is_success"] and sum(duration for _, duration in shown) == 100 * images
+    assert pictures.shape[1:] == (568, 924)
     assert np.abs(np.diff(pictures[:, :, :640], axis=0)).max() > 50, "the arm is seen moving"
     frames = pictures[:, 36 : 36 + 192, 648 : 648 + 192]
     assert np.abs(frames[-1] - frames[0]).max() > 50, "the agent's last frame is not its first one"
     with pytest.raises(SetupError, match="exists and is not overwritten"):
-        film("arrow_puzzle", out, seed=1)
+        film("arrow_puzzle_easy", out, seed=1)
