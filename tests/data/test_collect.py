@@ -51,6 +51,20 @@ def test_replaying_the_actions_gives_every_frame_again(policy: str) -> None:
     assert np.array_equal(frames, episodes.frames) and np.array_equal(states, hidden["macrostates"])
 
 
+def test_macrostates_apart_are_true_however_late_and_hidden_the_frames_are() -> None:
+    spec = registry.task("arrows:gesture=0.0,lag=1")
+    given = {"episodes": 4, "seed": 2, "execution": "kinematic", "appearance": "clean"}
+    episodes, apart, _ = collect(spec, policy_of("random", spec, 2), **given)
+    for index in range(4):
+        steps, rows = episodes.steps(index)
+        state, *after = map(tuple, apart["privileged"]["macrostates"][rows].tolist())
+        assert state in spec.rules.start_states
+        for action, reached in zip(episodes.actions[steps].tolist(), after, strict=True):
+            (outcome,) = spec.rules.outcomes(state, action)
+            assert outcome.macrostate == reached
+            state = reached
+
+
 def test_one_seed_is_one_content_and_another_is_another() -> None:
     first, _, _ = collected(episodes=3)
     again, _, _ = collected.__wrapped__(episodes=3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import pickle
 from typing import Any
 from unittest import mock
 
@@ -76,8 +77,11 @@ def test_parameters_of_a_world_mean_what_they_mean_of_macro_actions(family: str,
     start = STARTS[family]
     first, info = env.reset(seed=0, options={"macrostate": start})
     assert bool(info["instruction"]) == bool(option.get("told"))
+    looks = pickle.dumps(env.world.get_state().looks)
     expert = Expert(env)
     event = next(each for _ in range(9) for each in carry_out(env, expert, 0))
+    if option.keys() & {"appearance", "distractors"}:
+        assert pickle.dumps(env.world.get_state().looks) != looks, "anew after each event"
     after = tuple(event["macrostate"])
     assert not event["fault"]
     if option.get("goal_change") and family == "arrows":

@@ -24,7 +24,7 @@ import pytest
 from imagine_bench_serving import server as module
 from imagine_bench_serving.players import Players, Served
 from imagine_bench_serving.server import MOST_BYTES, Server, announce, serve
-from imagine_bench_serving.sockets import accept_key
+from imagine_bench_serving.sockets import TextSocket, accept_key
 from imagine_bench_serving.words import briefing, seen_in_words
 from PIL import Image
 from whole_outputs import KEPT, expected_of
@@ -296,6 +296,17 @@ def test_frames_of_a_websocket(
     line.send(kind, content, more)
     assert line.frame() == answer
     line.close()
+
+
+@pytest.mark.parametrize("size", [0, 125, 126, 65_535, 65_536])
+def test_a_message_of_any_length_is_framed_as_rfc_6455_says(size: int) -> None:
+    """Its length in 7 bits, or in 16 or 64 behind them, with the highest byte first."""
+    text, outgoing = bytes(each % 128 for each in range(size)), io.BytesIO()
+    short, more = (size, b"") if size < 126 else (126, size.to_bytes(2)) if size < 65_536 else (127, size.to_bytes(8))
+    masked = bytes(each ^ b"mask"[place % 4] for place, each in enumerate(text))
+    talk = TextSocket(io.BytesIO(bytes([0x81, 0x80 | short]) + more + b"mask" + masked), outgoing, 65_536)
+    talk.send(talk.receive())
+    assert outgoing.getvalue() == bytes([0x81, short]) + more + text
 
 
 def test_a_websocket_keeps_only_the_player_of_a_reset(refusing: Server) -> None:
