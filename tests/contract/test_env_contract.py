@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
 import warnings
@@ -13,6 +14,8 @@ import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.rules import Arrows
 from imagine_bench.tasks.arrows.world import ArrowWorld
+from imagine_bench.tasks.rendering import Renderer
+from imagine_bench.tasks.rendering.cameras import human_camera_view
 from imagine_bench.tasks.scenes.appearance import appearance
 from imagine_bench.tasks.scenes.constants import ARM_GROUP
 from worlds import WORLDS
@@ -165,12 +168,17 @@ def test_starts_are_spread_over_the_start_states(task):
     assert chi_square < len(starts) + 5 * np.sqrt(2 * len(starts))
 
 
-def test_views_draw_no_random_number():
-    env = make(appearance="strong", render_mode="rgb_array", width=80, height=60, camera="wrist", **KINEMATIC).unwrapped
+@pytest.mark.parametrize("camera", ["human", "far", "wrist"])
+def test_views_are_of_their_camera_and_draw_no_random_number(camera):
+    env = make(appearance="strong", render_mode="rgb_array", width=80, height=60, camera=camera, **KINEMATIC).unwrapped
     env.reset(seed=0)
     before = env.np_random.bit_generator.state
+    view = human_camera_view("human", 80, 60)
+    with contextlib.closing(Renderer(env.model, dataclasses.replace(view, camera=camera))) as renderer:
+        drawn = renderer.frame(env.data)
     first, again = env.render(), env.render()
-    assert first.shape == (60, 80, 3) and np.array_equal(first, again) and not np.shares_memory(first, again)
+    assert first.shape == (60, 80, 3) and not np.shares_memory(first, again)
+    assert all(np.array_equal(image, drawn) for image in (first, again, env.human_view(80, 60)))
     for width, height in ((32, 24), (64, 48)):
         view = env.human_view(width, height)
         assert view.shape == (height, width, 3) and view.std() > 20, "the whole scene"

@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 from imagine_bench_motion.control import datasets, demonstrator
 from imagine_bench_motion.control.datasets import DemonstrationSettings, collect, demonstration, describe, verify
+from recordings import logged, times
 
 from imagine_bench import registry
 from imagine_bench.arrays import Arrays, content_hash
@@ -130,8 +131,23 @@ def test_lerobot_rows_have_cameras_state_and_task(tmp_path: Path) -> None:
         *((0, lengths[0]), (lengths[0], sum(lengths)))
     ]
     stats = json.loads((tmp_path / "set/meta/stats.json").read_text())
-    images = np.concatenate([episode(index=index)["front"][:-1] for index in range(2)]) / 255
-    np.testing.assert_allclose(np.ravel(stats["observation.images.front"]["std"]), images.std(axis=(0, 1, 2)))
+    for told, name, scale in (
+        ("observation.images.front", "front", 255), ("observation.state", "proprio", 1), ("action", "actions", 1),
+    ):  # fmt: skip
+        every = np.concatenate([episode(index=index)[name][: lengths[index]] for index in range(2)]) / scale
+        of = every.reshape(-1, every.shape[-1])
+        for which in ("min", "max", "mean", "std"):
+            np.testing.assert_allclose(np.ravel(stats[told][which]), getattr(of, which)(axis=0), atol=1e-6)
+        assert stats[told]["count"] == [sum(lengths)]
+
+
+def test_a_recording_is_of_the_episode_that_is_asked_for(tmp_path: Path) -> None:
+    kept, path = written(tmp_path / "set", count=2), tmp_path / "second.rrd"
+    datasets.record(kept, 1, path)
+    assert times(path, "/motion/reward", "env_step") == set(range(len(episode(index=1)["rewards"]) + 1))
+    assert "**Success.**" in logged(path, "/motion/text", "TextDocument:text", "env_step")[-1][1][0]
+    with pytest.raises(InvalidValueError, match=r"Episode 2 is not in .*; give 0 to 1"):
+        datasets.record(kept, 2, path)
 
 
 def changed(name: str, place: object, value: object) -> dict[str, np.ndarray[Any, Any]]:
