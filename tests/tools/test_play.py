@@ -312,7 +312,7 @@ def test_continuous_control_is_told_which_options_it_does_not_take(option, capsy
 
 
 def test_a_film_lasts_as_long_as_its_motions_and_is_never_overwritten(tmp_path):
-    """At ten images a second; 0.8 s before and after each macro-action, 5 s more at the end, where the goal is reached."""
+    """At ten images a second; 0.8 s before and after each macro-action, and 5 s more at the goal."""
     out = film("arrow_puzzle_easy", tmp_path / "new" / "turn.gif", seed=1)
     with Image.open(out) as gif:
         shown = [(np.float32(each.convert("L")), each.info["duration"]) for each in ImageSequence.Iterator(gif)]
