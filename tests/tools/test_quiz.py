@@ -98,6 +98,9 @@ def test_a_person_is_asked_until_the_last_question_or_until_leaving(
     assert [image.name for image in images] == [f"question_{number}.png" for number in (1, 2, 3, 4)]
     assert all(np.asarray(Image.open(image)).std() > 1.0 for image in images)
     assert "Masked frame. First “" in capsys.readouterr().out
+    whole = quiz(EASY, 8, ask=mock.Mock(return_value="1"), judged=tmp_path, folder=tmp_path).splitlines()
+    (pairs,) = (line.split() for line in whole if line.startswith("single-cause pairs"))
+    assert (pairs[2], pairs[4], pairs[6]) == ("1", "6.2", "100.0"), "a pair is right if both are, of four answers each"
     assert quiz(EASY, 1, ask=typed(), judged=tmp_path, folder=tmp_path) == "No question was answered."
 
 

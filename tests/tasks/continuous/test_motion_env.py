@@ -284,7 +284,10 @@ def test_a_grip_that_slips_never_has_more_friction_than_one_that_holds(pad_frict
     [("arrows", {"cubes": 1}), ("arrows", {}), ("arrows", {"cubes": 6}), ("pick_place", {})],
 )
 def test_a_placement_moves_each_object_and_reads_as_before(family: str, options: dict[str, int]) -> None:
-    """In 100 starts some object is more than 3 cm off its slot, none more than 4.3 cm, and two are 8 cm apart."""
+    """In 100 starts some object is more than 3 cm off its slot, none more than 4.3 cm, and two are 8 cm apart.
+
+    The pointing hand is as far off as the place of what it points at.
+    """
     (placed, _), (plain, _) = environment(family, placement=0.04, **options), environment(family, **options)
     plain.reset(seed=0)
     slots_m = plain.world.object_poses()[:, :2]
@@ -299,6 +302,9 @@ def test_a_placement_moves_each_object_and_reads_as_before(family: str, options:
         off_m.append(np.abs(places_m - slots_m).max())
         turned_rad.extend(abs(yaw_rad) for *_, yaw_rad in placed.world.places)
         apart_m.extend(np.abs(places_m[later] - places_m[earlier]).max(axis=1))
+        plain.reset(options={"macrostate": info["macrostate"]})
+        hand_m = placed.data.body("hand").xpos - plain.data.body("hand").xpos
+        assert hand_m == pytest.approx([*placed.world.places[info["macrostate"][-1]][:2], 0.0])
     assert min(apart_m) >= 0.08  # a cube's edge is 55 mm
     assert 0.03 < max(off_m) < 0.045
     assert math.radians(4.0) < max(turned_rad) <= math.radians(5.0)
