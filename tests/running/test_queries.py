@@ -73,13 +73,14 @@ def test_demonstrations_are_optimal_and_seen_as_frames(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("task", registry.TASKS)
 def test_answers_are_the_rules_and_chance_has_none(task: str) -> None:
+    """They are about the last action, and go through ends."""
     rules = registry.task(task).rules
     oracle, answered, refused = LabelOracle(rules), 0, 0
     for state in rules.states:
         for first in range(rules.n_actions):
-            single = {(each.reward, each.terminated) for each in rules.outcomes(state, first)}
+            single = {Label(each.reward, each.terminated) for each in rules.outcomes(state, first)}
             answer = oracle.label(state, np.array([first]))
-            assert (answer is None) == (len(single) > 1)
+            assert answer == (single.pop() if len(single) == 1 else None)
             for second in range(rules.n_actions):
                 possible = {
                     Label(after.reward, after.terminated)
@@ -93,15 +94,6 @@ def test_answers_are_the_rules_and_chance_has_none(task: str) -> None:
     assert answered > 0 and (refused > 0) == by_chance
 
 
-def test_a_query_is_about_its_last_action_and_goes_through_ends() -> None:
-    oracle = LabelOracle(ArrowRules())
-    assert oracle.label((3, 1, 2, 0), np.array([0])) == Label(50.0, True)
-    assert oracle.label((3, 1, 2, 0), np.array([0, 1])) == Label(-1.0, False), "there and back through a goal"
-    for actions in ([], [6], [0, -1]):
-        with pytest.raises(InvalidValueError, match="give at least one, each from 0 to 5"):
-            oracle.label((3, 1, 2, 0), np.array(actions))
-
-
 def test_an_answer_is_of_where_the_scene_is_however_late_its_frame() -> None:
     learner, oracle, here, before = Pupil(small_runs.context()), LabelOracle(ArrowRules()), (3, 1, 2, 0), (2, 1, 3, 0)
     QueryBudget(learner, oracle, 30)(
@@ -109,6 +101,9 @@ def test_an_answer_is_of_where_the_scene_is_however_late_its_frame() -> None:
     )
     assert [label for _, label in learner.answers] == [oracle.label(here, actions) for actions, _ in learner.answers]
     assert any(label != oracle.label(before, actions) for actions, label in learner.answers)
+    for actions in ([], [6], [0, -1]):
+        with pytest.raises(InvalidValueError, match="give at least one, each from 0 to 5"):
+            oracle.label(here, np.array(actions))
 
 
 def test_no_more_queries_than_allowed_and_no_macrostate(tmp_path: Path) -> None:
