@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import minari
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -141,6 +142,14 @@ def test_lerobot_rows_have_cameras_state_and_task(tmp_path: Path) -> None:
         for which in ("min", "max", "mean", "std"):
             np.testing.assert_allclose(np.ravel(stats[told][which]), getattr(of, which)(axis=0), atol=1e-6)
         assert stats[told]["count"] == [sum(lengths)]
+
+
+def test_minari_recovers_the_environment_of_demonstrations(tmp_path: Path) -> None:
+    written(tmp_path / "set", "minari", look="strong")
+    (data,) = (tmp_path / "set").glob("*/data")
+    spec = minari.MinariDataset(data).recover_environment().spec
+    assert spec is not None and spec.id == "imagine_bench/ArrowPuzzleEasyMotion-v0"
+    assert spec.kwargs.items() >= {"appearance": "strong", "size": 32}.items()
 
 
 def test_a_recording_is_of_the_episode_that_is_asked_for(tmp_path: Path) -> None:

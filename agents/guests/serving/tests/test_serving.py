@@ -152,16 +152,17 @@ def test_words_tell_what_frames_show_and_no_more() -> None:
 
 
 def test_a_viewer_is_shown_the_frame_and_no_words_of_it(tmp_path: Path) -> None:
-    with served(tmp_path, observation="png", player="bo") as one:
+    chosen: dict[str, Any] = {"training": 2, "appearance": "strong"}
+    with served(tmp_path, observation="png", player="bo", **chosen) as one:
         status, answer = ask(one, "/reset", {})
         shown = answer["observation"]
-        assert (status, shown["words"]) == (200, "Test 1 of 3.")
+        assert (status, shown["words"]) == (200, "Training episode 1 of 2.")
         image = np.array(Image.open(io.BytesIO(base64.b64decode(shown["png"]))))
         assert "Seen now" not in ask(one, "/step", {"action": 2})[1]["observation"]["words"]
         call = {"jsonrpc": "2.0", "id": 1, "method": "tools/call", "params": {"name": "reset"}}
         content = ask(one, "/mcp", call)[1]["result"]["content"]
         assert [part["type"] for part in content] == ["text", "image"]
-    wanted = protocol_of_player("arrow_puzzle", "viewer", "cy", tests=3, execution="kinematic")
+    wanted = protocol_of_player("arrow_puzzle", "viewer", "cy", tests=3, execution="kinematic", **chosen)
     with played_run(wanted, tmp_path) as run:
         np.testing.assert_array_equal(run.reset()[0], image)
 
