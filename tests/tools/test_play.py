@@ -16,6 +16,7 @@ import pytest
 from fake_agents import FakeImaginer
 from imagine_bench_motion.control.keyboard import HandGame, keys_to_commands
 from PIL import Image, ImageSequence
+from scipy.spatial.transform import Rotation
 
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
@@ -280,6 +281,21 @@ def test_keys_move_the_hand_where_they_say(hand):
             seen, *_ = hand.step(keys_to_commands()[(key,)])
         moved_m = (-1) ** place * (seen["proprio"][9:12] - before_m)
         assert moved_m.argmax() == place // 2 and moved_m.max() > 0.02, key
+    for sign, key in ((1.0, "q"), (-1.0, "e")):
+        seen, _ = hand.reset()
+        before = seen["proprio"][12:16]
+        for _ in range(6):
+            seen, *_ = hand.step(keys_to_commands()[(key,)])
+        turned = Rotation.from_quat([before, seen["proprio"][12:16]], scalar_first=True)
+        assert sign * (turned[1] * turned[0].inv()).as_rotvec()[2] > 0.1, f"{key}: about the vertical, from above"
+
+
+def test_two_keys_at_once_do_what_both_do():
+    commands = keys_to_commands()
+    pairs = [keys for keys in commands if len(keys) == 2]
+    assert (len(commands), len(pairs)) == (9 + 36, 36)
+    for one, other in pairs:
+        np.testing.assert_array_equal(commands[one, other], commands[one,] + commands[other,])
 
 
 def test_a_press_closes_the_fingers_and_the_end_stands_still(hand):

@@ -254,5 +254,5 @@ def test_a_recording_shows_the_human_s_answer_after_the_motion():
     assert np.array_equal(hand[:-1], np.repeat(hand[:1], len(hand) - 1, axis=0))
     assert np.linalg.norm(hand[-1, :3] - hand[0, :3]) > 0.05
     assert np.linalg.norm(car[-1, :3] - car[-2, :3]) < 0.002
-    assert (np.diff(motion.time_s) > 0).all()
+    assert (np.diff(motion.time_s) > 0).all() and motion.time_s[-1] == pytest.approx(info["sim_time_s"] + 0.05)
     assert len(film) == len(motion.time_s) - 1
