@@ -14,7 +14,10 @@ LANES = 3
 
 
 def collected(envs, total_timesteps, seed=1):
-    """The acting half of ``cleanrl/dqn.py``: the contents of its buffer, by column, and the episodes it would print."""
+    """The acting half of ``cleanrl/dqn.py``: the contents of its buffer, by column, and the episodes it would print.
+
+    With each of these what its last info says of where it ended.
+    """
     rng = np.random.default_rng(seed)
     stored = []
     printed = []
@@ -28,8 +31,8 @@ def collected(envs, total_timesteps, seed=1):
         assert [info is not None for info in ended] == over.tolist()
         assert np.array_equal(infos.get("_final_observation", np.zeros(envs.num_envs)), over)
         assert not {"final_obs", "_final_obs", "episode", "_episode"} & set(infos)
-        episodes = [info["episode"] for info in ended if info and "episode" in info]
-        printed += [(global_step, each["r"].item(), each["l"].item()) for each in episodes]
+        episodes = [(info["episode"], info.get("macrostate", info.get("at"))) for info in ended if info]
+        printed += [(global_step, each["r"].item(), each["l"].item(), at.tolist()) for each, at in episodes]
         real_next_obs = next_obs.copy()
         for idx in np.flatnonzero(truncations):
             real_next_obs[idx] = infos["final_observation"][idx]
@@ -61,10 +64,10 @@ def test_equals_single_environments_with_gymnasiums_statistics():
     sync = gym.vector.SyncVectorEnv([thunk] * LANES, autoreset_mode=AutoresetMode.SAME_STEP)
     own = as_cleanrl(registry.vector_id(ARROWS), num_envs=LANES, execution="kinematic")
     ours, printed = collected(own, 40)
-    theirs, _ = collected(as_cleanrl(sync), 40)
-    assert all(np.array_equal(*columns) for columns in zip(ours, theirs, strict=True))
+    theirs, said = collected(as_cleanrl(sync), 40)
+    assert printed == said and all(np.array_equal(*columns) for columns in zip(ours, theirs, strict=True))
     lanes = [env.length_queue for env in sync.envs]
-    assert len(printed) > 10 and sum(length for *_, length in printed) == sum(map(sum, lanes)) > 100
+    assert len(printed) > 10 and sum(length for *_, length, _ in printed) == sum(map(sum, lanes)) > 100
 
 
 def test_the_last_frame_of_a_truncated_episode_is_stored():
@@ -73,4 +76,4 @@ def test_the_last_frame_of_a_truncated_episode_is_stored():
     (seen, seen_next, *_), printed = collected(as_cleanrl(sync), 6)
     assert seen[:, 0].max(axis=(1, 2, 3)).tolist() == [0, 1, 2, 0, 1, 2]
     assert seen_next[:, 1].max(axis=(1, 2, 3)).tolist() == [1, 2, 3, 1, 2, 3]
-    assert printed == [(2, 3.0, 3), (2, 3.0, 3), (5, 3.0, 3), (5, 3.0, 3)]
+    assert printed == [(2, 3.0, 3, 3), (2, 3.0, 3, 3), (5, 3.0, 3, 3), (5, 3.0, 3, 3)]

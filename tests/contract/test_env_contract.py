@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
 import warnings
@@ -13,6 +14,8 @@ import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.rules import Arrows
 from imagine_bench.tasks.arrows.world import ArrowWorld
+from imagine_bench.tasks.rendering import Renderer
+from imagine_bench.tasks.rendering.cameras import human_camera_view
 from imagine_bench.tasks.scenes.appearance import appearance
 from imagine_bench.tasks.scenes.constants import ARM_GROUP
 from worlds import WORLDS
@@ -165,12 +168,17 @@ def test_starts_are_spread_over_the_start_states(task):
     assert chi_square < len(starts) + 5 * np.sqrt(2 * len(starts))
 
 
-def test_views_draw_no_random_number():
-    env = make(appearance="strong", render_mode="rgb_array", width=80, height=60, camera="wrist", **KINEMATIC).unwrapped
+@pytest.mark.parametrize("camera", ["human", "far", "wrist"])
+def test_views_are_of_their_camera_and_draw_no_random_number(camera):
+    env = make(appearance="strong", render_mode="rgb_array", width=80, height=60, camera=camera, **KINEMATIC).unwrapped
     env.reset(seed=0)
     before = env.np_random.bit_generator.state
+    view = human_camera_view("human", 80, 60)
+    with contextlib.closing(Renderer(env.model, dataclasses.replace(view, camera=camera))) as renderer:
+        drawn = renderer.frame(env.data)
     first, again = env.render(), env.render()
-    assert first.shape == (60, 80, 3) and np.array_equal(first, again) and not np.shares_memory(first, again)
+    assert first.shape == (60, 80, 3) and not np.shares_memory(first, again)
+    assert all(np.array_equal(image, drawn) for image in (first, again, env.human_view(80, 60)))
     for width, height in ((32, 24), (64, 48)):
         view = env.human_view(width, height)
         assert view.shape == (height, width, 3) and view.std() > 20, "the whole scene"
@@ -198,21 +206,28 @@ def test_rewards_follow_what_was_read_where_a_cube_does_not_turn():
     assert (reward, terminated) == (-1.0, False)
 
 
-def test_a_pushed_cube_is_a_fault():
-    env = make().unwrapped
-    env.reset(seed=0, options={"macrostate": (3, 1, 2, 0)})
-    assert not env.step(0)[4]["fault"]
-    turn = env.world.executor.turn
+@pytest.mark.parametrize("shift_m", [0.0, 0.004, 0.006])
+@pytest.mark.parametrize(
+    ("task", "start", "motion", "pushed", "words"),
+    [
+        ("arrow_puzzle", (3, 1, 2, 0), "turn", "cube_2", "cube 2 was pushed 6 mm while cube 0 was turned"),
+        ("pick_place", (0, 0, 0, 0), "pick", "cup", "the cup was pushed 6 mm by the way"),
+    ],
+)
+def test_an_object_that_was_pushed_by_more_than_5_mm_is_a_fault(task, start, motion, pushed, words, shift_m):
+    env = make(task).unwrapped
+    env.reset(seed=0, options={"macrostate": start})
+    move = getattr(env.world.executor, motion)
 
     def clumsy(**arguments):
-        result = turn(**arguments)
-        env.data.joint("cube_2_joint").qpos[0] += 0.006
+        result = move(**arguments)
+        env.data.joint(f"{pushed}_joint").qpos[0] += shift_m
         return result
 
-    env.world.executor.turn = clumsy
+    setattr(env.world.executor, motion, clumsy)
     *_, info = env.step(0)
     env.close()
-    assert info["fault_reason"] == "cube 2 was pushed 6 mm while cube 0 was turned"
+    assert info["fault_reason"] == words * (shift_m > 0.005)
 
 
 def test_a_cube_that_slips_and_is_shoved_along_is_a_fault():
@@ -259,6 +274,12 @@ def kinematic():
     env.close()
 
 
+@pytest.mark.parametrize(("start", "legal"), [((3, 1, 2, 0), True), ((0, 1, 2, 0), True), ((1, 1, 2, 0), False)])
+def test_a_start_is_as_legal_as_its_macrostate_and_no_success(kinematic, start, legal):
+    _, info = kinematic.reset(options={"macrostate": start})
+    assert (info["legal"], info["success"], info["fault"]) == (legal, False, False)
+
+
 @pytest.mark.parametrize("given", [(np.ma.masked,) * 4, (0,) * 10**6, itertools.repeat(0)])
 def test_a_wrong_macrostate_is_refused(kinematic, given):
     with pytest.raises(InvalidValueError, match=r"No macrostate .*; give one of the 192 of imagine_b") as caught:
@@ -269,12 +290,14 @@ def test_a_wrong_macrostate_is_refused(kinematic, given):
 @pytest.mark.usefixtures("own_folder")  # for MuJoCo's own log
 @pytest.mark.parametrize("task", ["arrow_puzzle", "arrows:lag=2"])
 def test_a_simulation_that_blows_up_truncates(task):
-    """The scene stands as before."""
+    """The scene stands as before, and what was seen last is seen once more, however late it is."""
     env = gymnasium.make(registry.task(task).env_id)
     scene = env.unwrapped
     with pytest.raises(InvalidValueError, match=r"call reset\(\) first"):
         scene.step(0)
-    seen, start = env.reset(seed=0)
+    env.reset(seed=0, options={"macrostate": (1, 2, 0, 1)})
+    seen, *_, start = env.step(2)
+    assert start["legal"] and not start["success"]
     scene.data.joint("cube_2_joint").qpos[0] = 1e11
     standing = scene.data.qpos.copy()
     after, reward, terminated, truncated, info = env.step(0)
@@ -282,7 +305,7 @@ def test_a_simulation_that_blows_up_truncates(task):
     check_info(info, registry.task(task))
     assert info["fault"] and "diverged" in info["fault_reason"] and info["sim_time_s"] == 0.0
     assert np.array_equal(after, seen)
-    assert np.array_equal(info["macrostate"], start["macrostate"])
+    assert all(np.array_equal(info[name], start[name]) for name in ("macrostate", "shown"))
     assert np.array_equal(scene.data.qpos, standing) and len(scene.motion().time_s) == 1
     with pytest.raises(InvalidValueError, match=r"call reset\(\) first"):
         env.step(0)

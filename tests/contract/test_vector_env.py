@@ -152,6 +152,30 @@ def test_each_lane_goes_its_own_pace_and_sees_what_it_would_alone():
     assert not [each.name for each in threading.enumerate() if each.name.startswith("simulation")]
 
 
+@pytest.mark.parametrize("mode", [SAME_STEP, AutoresetMode.NEXT_STEP])
+def test_lanes_that_are_received_a_few_at_a_time_are_those_of_a_step(mode):
+    """In the order in which they end, through ends by rule and by the limit; what ended last is told with its lane."""
+    sync, vector = make_sync(mode, **SHORT), make(autoreset_mode=mode, **SHORT)
+    assert_same(*(env.reset(seed=[3, 1, 2]) for env in (sync, vector)))
+    rng, orders = np.random.default_rng(1), set()
+    for _ in range(8):
+        actions = rng.integers(6, size=N_LANES)
+        vector.send(actions)
+        *its, infos = sync.step(actions)
+        for n in (1, 2):
+            *own, told = vector.recv(n)
+            lanes = told.pop("env_id")
+            assert_same(own, [each[lanes] for each in its])
+            assert told["macrostate"].tolist() == infos["macrostate"][lanes].tolist()
+            if "final_info" in told:
+                over = told["_final_info"]
+                assert_same(told["final_info"]["macrostate"][over], infos["final_info"]["macrostate"][lanes][over])
+            orders.add(tuple(lanes))
+    assert len(orders) > 4
+    sync.close()
+    vector.close()
+
+
 def lasting(act, durations_s, action):
     """A macro-action that takes the next one of some durations."""
     *step, info = act(action)
@@ -301,6 +325,11 @@ def test_a_reset_forgets_what_a_lane_was_doing():
     again, _ = vector.reset(seed=4)
     assert len(ended) == 2 and np.array_equal(first, again)
     assert np.array_equal(vector.step(np.array([0, 2]))[0], expected)
+    vector.reset(seed=4)
+    vector.send([0, 2])
+    vector.reset(options={"reset_mask": np.array([True, False])})
+    seen, *_, infos = vector.recv()
+    assert infos["env_id"].tolist() == [1] and np.array_equal(seen, expected[1:]), "the other lane goes on"
     vector.close()
 
 

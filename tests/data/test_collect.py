@@ -32,6 +32,7 @@ TASK = registry.task("arrow_puzzle")
 def test_replaying_the_actions_gives_every_frame_again(policy: str) -> None:
     episodes, apart, _ = collected(policy)
     hidden, frames, states = apart["privileged"], [], []
+    assert hidden["seeds"].tolist() == [episode_seed("dataset", 0, k) for k in range(len(episodes))], "those of no run"
 
     def noted(frame: Frame, info: Info) -> None:
         frames.append(frame)
@@ -49,6 +50,20 @@ def test_replaying_the_actions_gives_every_frame_again(policy: str) -> None:
                 assert truncated == episodes.truncated[step] or policy == "uniform"
             assert info["is_success"] == episodes.success[index]
     assert np.array_equal(frames, episodes.frames) and np.array_equal(states, hidden["macrostates"])
+
+
+def test_macrostates_apart_are_true_however_late_and_hidden_the_frames_are() -> None:
+    spec = registry.task("arrows:gesture=0.0,lag=1")
+    given = {"episodes": 4, "seed": 2, "execution": "kinematic", "appearance": "clean"}
+    episodes, apart, _ = collect(spec, policy_of("random", spec, 2), **given)
+    for index in range(4):
+        steps, rows = episodes.steps(index)
+        state, *after = map(tuple, apart["privileged"]["macrostates"][rows].tolist())
+        assert state in spec.rules.start_states
+        for action, reached in zip(episodes.actions[steps].tolist(), after, strict=True):
+            (outcome,) = spec.rules.outcomes(state, action)
+            assert outcome.macrostate == reached
+            state = reached
 
 
 def test_one_seed_is_one_content_and_another_is_another() -> None:
@@ -76,12 +91,6 @@ def test_a_runs_agent_sees_as_in_its_run_and_through_the_given_encoder(tmp_path:
     write_json(tmp_path / "config.json", sealed(config))
     with pytest.raises(ArtefactError, match=r"through encoder arrow_puzzle-clean@.*, which arrow_puzzle-mild is not"):
         policy_of(str(tmp_path), TASK, 0, "arrow_puzzle-mild")
-
-
-def test_starts_are_those_of_no_run() -> None:
-    seeds = collected()[1]["privileged"]["seeds"].tolist()
-    others = [episode_seed(purpose, 0, k) for purpose in ("training", "evaluation", "tuning") for k in range(6)]
-    assert len({*seeds, *others}) == 6 + 18
 
 
 def test_the_oracle_is_optimal_and_chance_is_not() -> None:

@@ -117,3 +117,5 @@ def test_a_bound_by_hand() -> None:
     assert bound(SHORT) == 2
     assert bound(SHORT, share=0.7) == 0, "one guess in two leaves 75 %"
     assert bound(RING) == 0
+    wide = Places(starts=range(1, 100), goals={100}, pits={0}, around=200)
+    assert bound(wide, share=0.0) == 0, "also where there are more sets of unknown places than are tried"

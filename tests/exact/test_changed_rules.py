@@ -18,9 +18,14 @@ CHANGES = {
     "successes cost": "-5. -50! -1 -5.",
     "macro-actions are reversed": "-5. -1 50! -5.",
     "macro-actions are shifted": "50! -1 -5. -5.",
+    "macro-actions slip": "-5. 0 50! 0 -1 0 -5. 0",
+    "one macro-action has another's effect, too": "-1 50! -1 -5.",
     "the goal is here": "-5. 0 50! -5.",
 }
-"""By rule: the rewards of four macro-actions that fail (.), succeed (!), go on, and fail, if nothing is changed."""
+"""By rule: the rewards of four macro-actions that fail (.), succeed (!), go on, and fail, if nothing is changed.
+
+The first one also turns the other wheel forth, so that they are not alike.
+"""
 
 
 @pytest.mark.parametrize("name", CHANGES)

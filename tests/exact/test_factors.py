@@ -48,6 +48,27 @@ class _Coupled(Wheels):
         return tuple(found)
 
 
+class _Toll(Wheels):
+    """To turn a wheel back costs 2 more, whatever that leads to."""
+
+    def judge(self, state, action, reached, share=1.0):
+        found = super().judge(state, action, reached, share)
+        return dataclasses.replace(found, reward=found.reward - 2.0 * (action % 2))
+
+
+@pytest.mark.parametrize(
+    ("slip", "scopes"),
+    [(0.0, ("wheel 0, action", "action", "wheel 0")), (0.25, ("wheel 0, wheel 0 then", "action", "wheel 0 then"))],
+)
+def test_a_reward_that_the_choice_decides_is_read_from_it(slip, scopes):
+    """One wheel: of six entries and three conditions. If it may slip, the choice alone does not tell where it leads."""
+    found = certificate(spec_of(_Toll(n=1, slip=slip), 5))
+    classes = ("+48, success", "-3", "+50, success", "-1")
+    assert found.outcomes == tuple(zip(classes, (*scopes, "otherwise"), strict=True))
+    assert (found.facts, found.width, found.random, found.plan_lengths) == (9, 2, slip > 0, ((1, 2), (2, 1)))
+    assert slip or found.optimal_return == pytest.approx((48 + 49 + 50) / 3)
+
+
 class _Reordered(Wheels):
     """The same outcomes, which half of the macrostates name in another order."""
 

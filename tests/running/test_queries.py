@@ -20,7 +20,7 @@ from imagine_bench.interfaces.capabilities import Label
 from imagine_bench.protocols.data import RunSpec
 from imagine_bench.rules import fewest_actions
 from imagine_bench.running import runner
-from imagine_bench.running.evaluation import LabelOracle, Teacher, as_seen
+from imagine_bench.running.evaluation import LabelOracle, QueryBudget, Teacher, as_seen
 from imagine_bench.store import encoders
 from imagine_bench.store.results import RunResult
 from imagine_bench.store.run_folder import load_newest
@@ -53,7 +53,7 @@ def test_a_demonstration_keeps_its_images_and_hides_the_truth() -> None:
 
 
 def test_demonstrations_are_optimal_and_seen_as_frames(tmp_path: Path) -> None:
-    plain, shown = do(tmp_path / "plain"), do(tmp_path / "shown", demonstrations=4)
+    plain, shown = do(tmp_path / "plain"), do(tmp_path / "shown", demonstrations=4, feedback=3.0)
     assert shown.training_success[:4].all() and not plain.training_success.all()
     assert shown.training is not None
     fewest = [fewest_actions(registry.task("arrow_puzzle").rules, tuple(s)) for s in shown.training.starts[:4].tolist()]
@@ -63,6 +63,7 @@ def test_demonstrations_are_optimal_and_seen_as_frames(tmp_path: Path) -> None:
     assert starts[0] == starts[1], "the same six starts, whoever acts"
     for episode, transition in taught.shown:
         assert transition.observation.macrostate is None and transition.next_observation.macrostate is None
+        assert (transition.reward in (-5.0, -1.0, 50.0)) == (episode < 4), "a teacher says nothing of another's action"
         assert episode >= 4 or transition.reward == (50.0 if transition.terminated else -1.0)
     assert sum(episode < 4 for episode, _ in taught.shown) == shown.training_length[:4].sum()
 
@@ -72,13 +73,14 @@ def test_demonstrations_are_optimal_and_seen_as_frames(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("task", registry.TASKS)
 def test_answers_are_the_rules_and_chance_has_none(task: str) -> None:
+    """They are about the last action, and go through ends."""
     rules = registry.task(task).rules
     oracle, answered, refused = LabelOracle(rules), 0, 0
     for state in rules.states:
         for first in range(rules.n_actions):
-            single = {(each.reward, each.terminated) for each in rules.outcomes(state, first)}
+            single = {Label(each.reward, each.terminated) for each in rules.outcomes(state, first)}
             answer = oracle.label(state, np.array([first]))
-            assert (answer is None) == (len(single) > 1)
+            assert answer == (single.pop() if len(single) == 1 else None)
             for second in range(rules.n_actions):
                 possible = {
                     Label(after.reward, after.terminated)
@@ -92,13 +94,16 @@ def test_answers_are_the_rules_and_chance_has_none(task: str) -> None:
     assert answered > 0 and (refused > 0) == by_chance
 
 
-def test_a_query_is_about_its_last_action_and_goes_through_ends() -> None:
-    oracle = LabelOracle(ArrowRules())
-    assert oracle.label((3, 1, 2, 0), np.array([0])) == Label(50.0, True)
-    assert oracle.label((3, 1, 2, 0), np.array([0, 1])) == Label(-1.0, False), "there and back through a goal"
+def test_an_answer_is_of_where_the_scene_is_however_late_its_frame() -> None:
+    learner, oracle, here, before = Pupil(small_runs.context()), LabelOracle(ArrowRules()), (3, 1, 2, 0), (2, 1, 3, 0)
+    QueryBudget(learner, oracle, 30)(
+        Observation(frame=np.zeros((64, 64, 3), np.uint8)), {"macrostate": np.array(here), "shown": np.array(before)}
+    )
+    assert [label for _, label in learner.answers] == [oracle.label(here, actions) for actions, _ in learner.answers]
+    assert any(label != oracle.label(before, actions) for actions, label in learner.answers)
     for actions in ([], [6], [0, -1]):
         with pytest.raises(InvalidValueError, match="give at least one, each from 0 to 5"):
-            oracle.label((3, 1, 2, 0), np.array(actions))
+            oracle.label(here, np.array(actions))
 
 
 def test_no_more_queries_than_allowed_and_no_macrostate(tmp_path: Path) -> None:

@@ -84,17 +84,23 @@ def test_a_person_is_asked_until_the_last_question_or_until_leaving(
         rows += [f"patches,30,{seed},masked frame,{each}" for seed, each in enumerate(("0.25", right))]
         (report / "worlds.csv").write_text("\n".join(rows))
         os.utime(report / "worlds.csv", (made_s, made_s))
-    said = quiz(EASY, 8, ask=typed("x", "0", "9", "1", "2"), judged=tmp_path / "judge", folder=tmp_path)
+    said = quiz(EASY, 8, ask=typed("x", "0", "9", "1", "2", "1"), judged=tmp_path / "judge", folder=tmp_path)
     lines = [line.split() for line in said.splitlines()]
     assert ["family", "questions", "you", "chance", "copy", "exact", "patches"] in lines
     (masked,) = (line for line in lines if line[:2] == ["masked", "frame"])
     assert masked[2] == "1" and masked[3] in ("0.0", "100.0") and masked[-2:] == ["100.0", "50.0"]
     (plan,) = (line for line in lines if line[:2] == ["shortest", "plan"])
     assert plan[-1] == "–", "the model was not judged on it"
+    (reached,) = (line for line in lines if line[:1] == ["reachability"])
+    answered = ["1", "0.0", "50.0", "100.0", "100.0", "–"]
+    assert reached[1:] == answered, "the goal is two away: whoever says that nothing changes is right, yes is wrong"
     images = sorted((tmp_path / EASY).glob("*.png"))
-    assert [image.name for image in images] == [f"question_{number}.png" for number in (1, 2, 3)]
+    assert [image.name for image in images] == [f"question_{number}.png" for number in (1, 2, 3, 4)]
     assert all(np.asarray(Image.open(image)).std() > 1.0 for image in images)
     assert "Masked frame. First “" in capsys.readouterr().out
+    whole = quiz(EASY, 8, ask=mock.Mock(return_value="1"), judged=tmp_path, folder=tmp_path).splitlines()
+    (pairs,) = (line.split() for line in whole if line.startswith("single-cause pairs"))
+    assert (pairs[2], pairs[4], pairs[6]) == ("1", "6.2", "100.0"), "a pair is right if both are, of four answers each"
     assert quiz(EASY, 1, ask=typed(), judged=tmp_path, folder=tmp_path) == "No question was answered."
 
 

@@ -10,7 +10,7 @@ import pytest
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Outcome
-from imagine_bench.rules import facts, is_random
+from imagine_bench.rules import facts, is_random, states_of_play
 
 NAMES = ["arrow_puzzle", "arrow_puzzle_hard", "arrow_puzzle_toward", "arrow_puzzle_clockwise"]
 FAMILY = EASY, HARD, TOWARD, CLOCKWISE = tuple(registry.task(name).rules for name in NAMES)
@@ -22,6 +22,7 @@ def test_counts_of_macrostates():
     assert len(legal) == 72
     assert [sum(map(rules.is_goal, rules.states)) for rules in FAMILY] == [18, 6, 18, 6]
     assert [len(rules.start_states) for rules in FAMILY] == [54, 66, 54, 66]
+    assert set(states_of_play(EASY)) == set(EASY.start_states), "no goal is out of reach"
     assert not any(map(is_random, FAMILY))
 
 

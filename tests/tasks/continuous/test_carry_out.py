@@ -115,13 +115,15 @@ def test_a_wrong_action_is_refused_before_anything_moves(control: str, actions: 
 
 @pytest.mark.usefixtures("own_folder")
 def test_a_blown_up_simulation_has_no_second_event() -> None:
-    env = make_arrows(control="twist", observation="proprio")
+    """What was seen last, an event late, is seen once more."""
+    env = make_arrows(control="twist", observation="proprio", lag=1)
     actions = experts(env, 541, 120)
-    env.reset(seed=541)
+    start, _ = env.reset(seed=541)
     env.carry_out(actions[:-1])
-    assert env.act(actions[-1])[3]["event"]
+    assert env.step(actions[-1])[4]["event"]
     env.world.data.qpos[env.world.object_qpos[0, 0]] = 1e11
-    *_, truncated, info = env.act(np.zeros(7, dtype=np.float32))
+    seen, *_, truncated, info = env.step(np.zeros(7, dtype=np.float32))
+    assert np.array_equal(seen, start)
     assert (truncated, bool(info["event"]), info["fault_reason"]) == (True, False, "the simulation blew up")
     with pytest.raises(InvalidValueError, match=r"call reset\(\) first"):
         env.carry_out(actions)

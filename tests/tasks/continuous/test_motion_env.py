@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import pickle
 from typing import Any
 from unittest import mock
 
@@ -76,8 +77,11 @@ def test_parameters_of_a_world_mean_what_they_mean_of_macro_actions(family: str,
     start = STARTS[family]
     first, info = env.reset(seed=0, options={"macrostate": start})
     assert bool(info["instruction"]) == bool(option.get("told"))
+    looks = pickle.dumps(env.world.get_state().looks)
     expert = Expert(env)
     event = next(each for _ in range(9) for each in carry_out(env, expert, 0))
+    if option.keys() & {"appearance", "distractors"}:
+        assert pickle.dumps(env.world.get_state().looks) != looks, "anew after each event"
     after = tuple(event["macrostate"])
     assert not event["fault"]
     if option.get("goal_change") and family == "arrows":
@@ -280,7 +284,10 @@ def test_a_grip_that_slips_never_has_more_friction_than_one_that_holds(pad_frict
     [("arrows", {"cubes": 1}), ("arrows", {}), ("arrows", {"cubes": 6}), ("pick_place", {})],
 )
 def test_a_placement_moves_each_object_and_reads_as_before(family: str, options: dict[str, int]) -> None:
-    """In 100 starts some object is more than 3 cm off its slot, none more than 4.3 cm, and two are 8 cm apart."""
+    """In 100 starts some object is more than 3 cm off its slot, none more than 4.3 cm, and two are 8 cm apart.
+
+    The pointing hand is as far off as the place of what it points at.
+    """
     (placed, _), (plain, _) = environment(family, placement=0.04, **options), environment(family, **options)
     plain.reset(seed=0)
     slots_m = plain.world.object_poses()[:, :2]
@@ -295,6 +302,9 @@ def test_a_placement_moves_each_object_and_reads_as_before(family: str, options:
         off_m.append(np.abs(places_m - slots_m).max())
         turned_rad.extend(abs(yaw_rad) for *_, yaw_rad in placed.world.places)
         apart_m.extend(np.abs(places_m[later] - places_m[earlier]).max(axis=1))
+        plain.reset(options={"macrostate": info["macrostate"]})
+        hand_m = placed.data.body("hand").xpos - plain.data.body("hand").xpos
+        assert hand_m == pytest.approx([*placed.world.places[info["macrostate"][-1]][:2], 0.0])
     assert min(apart_m) >= 0.08  # a cube's edge is 55 mm
     assert 0.03 < max(off_m) < 0.045
     assert math.radians(4.0) < max(turned_rad) <= math.radians(5.0)

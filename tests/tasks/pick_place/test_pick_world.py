@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 from imagine_bench.tasks.motion.arm_model import ArmModel
+from imagine_bench.tasks.motion.orientation import yaw_rad
 from imagine_bench.tasks.pick_place.rules import HAND_OVER, OPEN_PALM, WITHDRAWN
 from imagine_bench.tasks.pick_place.scene import PALM_M, TIMESTEP_S
 from imagine_bench.tasks.pick_place.spec import SPEC
@@ -81,14 +82,19 @@ def test_motions_follow_the_rules_within_the_robot_s_limits(world, state, action
     assert np.abs(world.object_poses()[untouched, :3] - before[untouched, :3]).max(initial=0.0) < 1e-4
 
 
-def test_an_object_is_held_midway_anywhere_along_the_pads():
+def test_a_grip_halves_how_far_an_object_is_off_and_a_palm_does_not():
+    """Along the pads and turned; between the pads it is held midway. The same draw on the table, held, and given."""
     varied = PickWorld(appearance("strong"))
-    off_m = []
     for seed in range(3):
-        varied.place((1, 0, 0, 1), np.random.default_rng(seed))
-        off_m.append(varied.object_poses()[0, :2] - varied.data.site("tcp").xpos[:2])
-    along_m, between_m = np.abs(off_m).T
-    assert along_m.max() > 1e-3 and between_m.max() < 1e-9
+        off = []
+        for state, place_m in (((0, 0, 0, 1), standing_m(0)), ((1, 0, 0, 1), None), ((2, 0, 0, 3), PALM_M)):
+            varied.place(state, np.random.default_rng(seed))
+            pose = varied.object_poses()[0]
+            middle_m = varied.data.site("tcp").xpos if place_m is None else np.array(place_m)
+            off.append([*(pose[:2] - middle_m[:2]), yaw_rad(*pose[3:])])
+        x_m, _, turned_rad = off[0]
+        np.testing.assert_allclose(off[1:], [(x_m / 2, 0.0, turned_rad / 2), off[0]], atol=1e-9)
+        assert min(abs(x_m), abs(turned_rad)) > 1e-4
 
 
 def test_a_ball_is_picked_alike_however_it_has_rolled(world):
@@ -248,5 +254,5 @@ def test_a_recording_shows_the_human_s_answer_after_the_motion():
     assert np.array_equal(hand[:-1], np.repeat(hand[:1], len(hand) - 1, axis=0))
     assert np.linalg.norm(hand[-1, :3] - hand[0, :3]) > 0.05
     assert np.linalg.norm(car[-1, :3] - car[-2, :3]) < 0.002
-    assert (np.diff(motion.time_s) > 0).all()
+    assert (np.diff(motion.time_s) > 0).all() and motion.time_s[-1] == pytest.approx(info["sim_time_s"] + 0.05)
     assert len(film) == len(motion.time_s) - 1

@@ -9,43 +9,52 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import minari
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from imagine_bench_motion.control import datasets, demonstrator
 from imagine_bench_motion.control.datasets import DemonstrationSettings, collect, demonstration, describe, verify
+from recordings import logged, times
 
 from imagine_bench import registry
 from imagine_bench.arrays import Arrays, content_hash
 from imagine_bench.cli import exit_code as main
-from imagine_bench.data.folder import FORMATS, new_folder, read_card, read_dataset, write_card
+from imagine_bench.data.folder import FORMATS, new_folder, read_card, read_dataset, read_files, write_card
 from imagine_bench.data.motion import CAMERAS, Demonstrations, Digest, read_demonstrations
 from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.seeding import episode_seed
 
 EASY = "arrow_puzzle_easy"  # one cube, at most two macro-actions
 
 
 @functools.cache
-def episode(policy: str = "expert", index: int = 0, task: str = EASY) -> Arrays:
-    return demonstration(DemonstrationSettings(task=task, policy=policy, seed=0, appearance="clean", size=32), index)
+def episode(policy: str = "expert", index: int = 0, task: str = EASY, look: str = "clean") -> Arrays:
+    return demonstration(DemonstrationSettings(task=task, policy=policy, seed=0, appearance=look, size=32), index)
 
 
-def written(folder: Path, format: str = "npz", task: str = EASY, **changes: np.ndarray[Any, Any]) -> Demonstrations:
-    """One episode as a folder whose card agrees with it, whatever was changed in it."""
-    told = {**episode(task=task), **changes}
-    shown = {name: array for name, array in told.items() if name not in ("seed", "macrostates")}
+def written(
+    folder: Path, format: str = "npz", count: int = 1, *, task: str = EASY, look: str = "clean",
+    **changes: np.ndarray[Any, Any],
+) -> Demonstrations:  # fmt: skip
+    """Episodes as a folder whose card agrees with them, whatever was changed in the first."""
+    told = [episode(index=index, task=task, look=look) for index in range(count)]
+    told[0] = {**told[0], **changes}
+    shown = [{name: each[name] for name in each if name not in ("seed", "macrostates")} for each in told]
     digest = Digest()
-    digest.add(shown)
+    for each in shown:
+        digest.add(each)
     env_id = registry.motion_id(registry.task(task).env_id)
     card = {
         "task": task, "env_id": env_id, "policy": "expert", "control": "twist", "rate_hz": 25.0,
-        "appearance": "clean", "size": 32, "control_names": list("xyzabcg"), "description": "", "format": format,
+        "appearance": look, "size": 32, "control_names": list("xyzabcg"), "description": "", "format": format,
         "content": str(digest),
     }  # fmt: skip
     with new_folder(folder, format) as partial:
         (partial / "episodes").mkdir()
-        registry.load(FORMATS[format]).write_motion(partial, iter([shown]), card)
-        hidden = {"seeds": told["seed"][None], "macrostates": told["macrostates"]}
+        registry.load(FORMATS[format]).write_motion(partial, iter(shown), card)
+        seeds, macrostates = ([each[name] for each in told] for name in ("seed", "macrostates"))
+        hidden = {"seeds": np.array(seeds), "macrostates": np.concatenate(macrostates)}
         whole = write_card(partial, card, {"privileged": hidden})
     return Demonstrations(folder=folder, card=whole)
 
@@ -89,14 +98,14 @@ def test_random_commands_are_held_and_a_mixed_set_has_each_policy_in_turn() -> N
 
 
 @pytest.mark.parametrize("format", FORMATS)
-def test_each_format_gives_the_episode_back(tmp_path: Path, format: str) -> None:
-    kept = written(tmp_path / "set", format)
-    (found,) = read_demonstrations(tmp_path / "set")
-    n_steps = len(found["rewards"])
-    held = {name: array[:n_steps] for name, array in episode().items() if name in found}
-    assert content_hash({name: array[:n_steps] for name, array in found.items()}) == content_hash(held)
-    assert set(episode()) - set(found) == {"seed", "macrostates"}, "no learner is given them"
-    assert verify(kept).startswith("Holds. 1 of 1 episodes replay")
+def test_each_format_gives_the_episodes_back(tmp_path: Path, format: str) -> None:
+    kept = written(tmp_path / "set", format, count=2)
+    for index, found in enumerate(read_demonstrations(tmp_path / "set")):
+        told, n_steps = episode(index=index), len(found["rewards"])
+        held = {name: array[:n_steps] for name, array in told.items() if name in found}
+        assert content_hash({name: array[:n_steps] for name, array in found.items()}) == content_hash(held)
+        assert set(told) - set(found) == {"seed", "macrostates"}, "no learner is given them"
+    assert verify(kept).startswith("Holds. 2 of 2 episodes replay")
     with pytest.raises(InvalidValueError, match="has hand commands, no macro-actions"):
         read_dataset(tmp_path / "set")
 
@@ -104,18 +113,52 @@ def test_each_format_gives_the_episode_back(tmp_path: Path, format: str) -> None
 def test_lerobot_rows_have_cameras_state_and_task(tmp_path: Path) -> None:
     said = episode()["instruction"].copy()
     said[40:] = "Stop."
-    written(tmp_path / "set", "lerobot", instruction=said.astype("<U40"))
+    written(tmp_path / "set", "lerobot", count=2, instruction=said.astype("<U40"))
+    lengths = [len(episode(index=index)["rewards"]) for index in range(2)]
+    count = np.concatenate(list(map(np.arange, lengths)))
     info = json.loads((tmp_path / "set/meta/info.json").read_text())
     table = pq.read_table(tmp_path / "set/data/chunk-000/file-000.parquet")
     assert set(table.schema.names) == set(info["features"])
-    assert info["fps"] == 25 and info["total_tasks"] == 2
+    assert [info[name] for name in ("fps", "total_tasks", "total_episodes", "total_frames")] == [25, 2, 2, sum(lengths)]
     images = {f"observation.images.{name}": [32, 32, 3] for name in CAMERAS}
     shapes = {**images, "action": [7], "observation.state": [16]}
     assert {name: info["features"][name]["shape"] for name in shapes} == shapes
-    assert table["task_index"].to_pylist() == [0] * 40 + [1] * (len(table) - 40)
-    np.testing.assert_allclose(table["timestamp"].to_numpy(), np.arange(len(table)) / 25, atol=1e-5)
-    (row,) = pq.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pylist()
-    assert row["tasks"] == [said[0], "Stop."]
+    numbers = {"index": np.arange(len(count)), "frame_index": count, "episode_index": np.repeat([0, 1], lengths)}
+    numbers["task_index"] = (numbers["index"] >= 40) & (numbers["index"] < lengths[0])
+    for name, column in numbers.items():
+        np.testing.assert_array_equal(table[name].to_numpy(), column, err_msg=name)
+    np.testing.assert_allclose(table["timestamp"].to_numpy(), count / 25, atol=1e-5)
+    rows = pq.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    assert [row["tasks"] for row in rows] == [[said[0], "Stop."], [said[0]]]
+    assert [(row["dataset_from_index"], row["dataset_to_index"]) for row in rows] == [
+        *((0, lengths[0]), (lengths[0], sum(lengths)))
+    ]
+    stats = json.loads((tmp_path / "set/meta/stats.json").read_text())
+    for told, name, scale in (
+        ("observation.images.front", "front", 255), ("observation.state", "proprio", 1), ("action", "actions", 1),
+    ):  # fmt: skip
+        every = np.concatenate([episode(index=index)[name][: lengths[index]] for index in range(2)]) / scale
+        of = every.reshape(-1, every.shape[-1])
+        for which in ("min", "max", "mean", "std"):
+            np.testing.assert_allclose(np.ravel(stats[told][which]), getattr(of, which)(axis=0), atol=1e-6)
+        assert stats[told]["count"] == [sum(lengths)]
+
+
+def test_minari_recovers_the_environment_of_demonstrations(tmp_path: Path) -> None:
+    written(tmp_path / "set", "minari", look="strong")
+    (data,) = (tmp_path / "set").glob("*/data")
+    spec = minari.MinariDataset(data).recover_environment().spec
+    assert spec is not None and spec.id == "imagine_bench/ArrowPuzzleEasyMotion-v0"
+    assert spec.kwargs.items() >= {"appearance": "strong", "size": 32}.items()
+
+
+def test_a_recording_is_of_the_episode_that_is_asked_for(tmp_path: Path) -> None:
+    kept, path = written(tmp_path / "set", count=2), tmp_path / "second.rrd"
+    datasets.record(kept, 1, path)
+    assert times(path, "/motion/reward", "env_step") == set(range(len(episode(index=1)["rewards"]) + 1))
+    assert "**Success.**" in logged(path, "/motion/text", "TextDocument:text", "env_step")[-1][1][0]
+    with pytest.raises(InvalidValueError, match=r"Episode 2 is not in .*; give 0 to 1"):
+        datasets.record(kept, 2, path)
 
 
 def changed(name: str, place: object, value: object) -> dict[str, np.ndarray[Any, Any]]:
@@ -149,17 +192,25 @@ def test_what_does_not_follow_from_the_commands_is_found(tmp_path: Path, forgery
     "task", ["arrows:cubes=1,slip=0.5", pytest.param("pick_place:goal_change=0.5", marks=pytest.mark.slow)]
 )
 def test_worlds_with_options_and_chance_replay(tmp_path: Path, task: str) -> None:
-    assert verify(written(tmp_path / "set", task=task)).startswith("Holds.")
+    assert verify(written(tmp_path / "set", task=task, look="strong")).startswith("Holds.")
 
 
-def test_the_optimum_is_that_of_commands_to_which_a_slip_costs_nothing(tmp_path: Path) -> None:
-    """A macro-action that slips is one of the few that an episode has."""
-    options = {"policy": "expert", "episodes": 1, "seed": 0, "appearance": "clean", "size": 32, "workers": 1}
-    kept = collect("arrows:cubes=1,slip=0.9", folder=tmp_path / "set", format="npz", **options)
-    facts = registry.task("arrows:cubes=1").facts()
+def test_a_card_counts_its_episodes_and_has_the_optimum_of_commands(tmp_path: Path) -> None:
+    """To which a slip costs nothing. A macro-action that slips is one of the few that an episode has."""
+    options = {"policy": "mixed", "episodes": 3, "seed": 0, "appearance": "clean", "size": 32, "workers": 1}
+    kept = collect(f"{EASY}:slip=0.5", folder=tmp_path / "set", format="npz", **options)
+    facts = registry.task(EASY).facts()
     assert (kept.card["optimum"], kept.card["optimal_return"]) == (facts.optimum, facts.optimal_return)
     assert registry.task(kept.card["task"]).facts().optimum < 0.7
-    assert f"optimum {facts.optimal_return:.2f} if all is seen" in describe(kept)
+    rewards, ends = zip(*((each["rewards"], each["success"][-1]) for each in kept), strict=True)
+    solved, seeds = sum(ends), read_files(kept.folder, kept.card)["privileged"]["seeds"]
+    assert seeds.tolist() == [episode_seed("dataset", 0, index) for index in range(3)] and 0 < solved < 3
+    for line in (
+        f"episodes      3 of {sum(map(len, rewards))} commands at 25 Hz, as npz",
+        f"success       {solved / 3:.1%} of episodes [",
+        f"return        {np.concatenate(rewards).sum() / 3:.2f} an episode; optimum {facts.optimal_return:.2f} if",
+    ):
+        assert line in describe(kept)
 
 
 def test_an_image_that_was_changed_is_not_that_of_the_card(tmp_path: Path) -> None:

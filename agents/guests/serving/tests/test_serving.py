@@ -24,7 +24,7 @@ import pytest
 from imagine_bench_serving import server as module
 from imagine_bench_serving.players import Players, Served
 from imagine_bench_serving.server import MOST_BYTES, Server, announce, serve
-from imagine_bench_serving.sockets import accept_key
+from imagine_bench_serving.sockets import TextSocket, accept_key
 from imagine_bench_serving.words import briefing, seen_in_words
 from PIL import Image
 from whole_outputs import KEPT, expected_of
@@ -152,16 +152,17 @@ def test_words_tell_what_frames_show_and_no_more() -> None:
 
 
 def test_a_viewer_is_shown_the_frame_and_no_words_of_it(tmp_path: Path) -> None:
-    with served(tmp_path, observation="png", player="bo") as one:
+    chosen: dict[str, Any] = {"training": 2, "appearance": "strong"}
+    with served(tmp_path, observation="png", player="bo", **chosen) as one:
         status, answer = ask(one, "/reset", {})
         shown = answer["observation"]
-        assert (status, shown["words"]) == (200, "Test 1 of 3.")
+        assert (status, shown["words"]) == (200, "Training episode 1 of 2.")
         image = np.array(Image.open(io.BytesIO(base64.b64decode(shown["png"]))))
         assert "Seen now" not in ask(one, "/step", {"action": 2})[1]["observation"]["words"]
         call = {"jsonrpc": "2.0", "id": 1, "method": "tools/call", "params": {"name": "reset"}}
         content = ask(one, "/mcp", call)[1]["result"]["content"]
         assert [part["type"] for part in content] == ["text", "image"]
-    wanted = protocol_of_player("arrow_puzzle", "viewer", "cy", tests=3, execution="kinematic")
+    wanted = protocol_of_player("arrow_puzzle", "viewer", "cy", tests=3, execution="kinematic", **chosen)
     with played_run(wanted, tmp_path) as run:
         np.testing.assert_array_equal(run.reset()[0], image)
 
@@ -296,6 +297,17 @@ def test_frames_of_a_websocket(
     line.send(kind, content, more)
     assert line.frame() == answer
     line.close()
+
+
+@pytest.mark.parametrize("size", [0, 125, 126, 65_535, 65_536])
+def test_a_message_of_any_length_is_framed_as_rfc_6455_says(size: int) -> None:
+    """Its length in 7 bits, or in 16 or 64 behind them, with the highest byte first."""
+    text, outgoing = bytes(each % 128 for each in range(size)), io.BytesIO()
+    short, more = (size, b"") if size < 126 else (126, size.to_bytes(2)) if size < 65_536 else (127, size.to_bytes(8))
+    masked = bytes(each ^ b"mask"[place % 4] for place, each in enumerate(text))
+    talk = TextSocket(io.BytesIO(bytes([0x81, 0x80 | short]) + more + b"mask" + masked), outgoing, 65_536)
+    talk.send(talk.receive())
+    assert outgoing.getvalue() == bytes([0x81, short]) + more + text
 
 
 def test_a_websocket_keeps_only_the_player_of_a_reset(refusing: Server) -> None:
