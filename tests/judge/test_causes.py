@@ -3,17 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
+import math
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from imagine_bench import registry
 from imagine_bench.exact.values import true_model
 from imagine_bench.interfaces import Outcome, State, TaskSpec
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes
-from imagine_bench.judge.causes import CAUSES, Attribution, FailedEpisode, drawn_by, memory_suffices, place
+from imagine_bench.judge.causes import (
+    CAUSES,
+    Attribution,
+    FailedEpisode,
+    drawn_by,
+    expected_rightly,
+    memory_suffices,
+    place,
+)
 from imagine_bench.rules import fewest_actions, states_of
 from imagine_bench.store.results import PolicyTable
 
@@ -87,6 +98,24 @@ def test_what_was_never_experienced_is_charged_to_experience() -> None:
     assert cause(does(dict.fromkeys(STATES, 0), model_of(SPEC)), NONE, FAILED) == "planning", "the model needs no more"
     odd = np.array([[9, 9, 9, 9, 0]])  # a scene that was no macrostate
     assert cause(does(OPTIMAL, None), odd, FAILED) == "unexperienced"
+
+
+@pytest.mark.parametrize("slip", [0.0, 0.25])
+def test_what_a_model_expects_rightly_is_a_share_of_each_macro_action(slip: float) -> None:
+    """Of every second pair it expects an end: right as often as there is one. Else it knows no slips."""
+    spec, never = (registry.task(f"arrows:cubes=2,slip={each}") for each in (slip, 0.0))
+    states = states_of(spec.rules)
+    held = model_of(never, lambda state, action: (sum(state) + action) % 2 == 0)
+    found = []
+    for state, action in itertools.product(states, range(spec.n_actions)):
+        outcomes = [] if spec.rules.is_terminal(state) else spec.rules.outcomes(state, action)
+        if (sum(state) + action) % 2 == 0:
+            found += [sum(each.probability for each in outcomes if each.terminated)] * bool(outcomes)
+        else:
+            found += [1.0 - slip] * bool(outcomes)
+    right = expected_rightly(spec.rules, does(dict.fromkeys(states, 0), held, states))
+    assert right == pytest.approx(np.mean(found)) and 0.5 * (1.0 - slip) < right < 1.0 - slip
+    assert math.isnan(expected_rightly(spec.rules, does(dict.fromkeys(states, 0), None, states)))
 
 
 def test_a_start_from_which_no_plan_fits_is_unlucky() -> None:

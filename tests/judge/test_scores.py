@@ -16,7 +16,14 @@ from imagine_bench.interfaces import Frame, Rules, State
 from imagine_bench.interfaces.model import Imagined, WorldModel
 from imagine_bench.judge import questions
 from imagine_bench.judge.questions import FRAMES
-from imagine_bench.judge.scores import after_the_end_scores, by_depth, filter_scores, one_step_scores, ranking_scores
+from imagine_bench.judge.scores import (
+    after_the_end_scores,
+    by_depth,
+    calibration_error,
+    filter_scores,
+    one_step_scores,
+    ranking_scores,
+)
 
 ERRORS = (
     *("total_variation", "missed", "hallucinated", "unreadable", "outcome_ece", "outcome_brier", "reward_error"),
@@ -270,6 +277,11 @@ def test_known_mistakes_are_charged_exactly() -> None:
     assert scores["risk_coverage"] == pytest.approx(sum(uncertain) / count)
     assert (scores["filter_keeps"], scores["filter_error"]) == (pytest.approx(1.0 - share), 0.0)
     answers = world.predictions(mistaken(world, wrong), world.one_step)
+    never = {pairs[index] for index in (3, 5)}  # it is unsure of the first of them alone, and of two that were seen
+    some = one_step_scores(world.spec, world.one_step, answers, set(pairs) - never)
+    others = len(pairs) - 4
+    assert some["auroc_never"] == pytest.approx((others + 2 / 2 + others / 2) / (2 * (others + 2)))
+    assert some["auroc_either"] == pytest.approx((3 + 1 / 2) / 4)
     unknown = one_step_scores(world.spec, world.one_step, answers, None)
     assert unknown["auroc_wrong"] == 1.0
     assert math.isnan(unknown["auroc_never"]) and math.isnan(unknown["auroc_either"]), "its data are not known"
@@ -285,7 +297,16 @@ def test_the_value_of_a_filter_is_the_cost_of_mistakes() -> None:
     }
     scores = world.scores(mistaken(world, ends))
     assert scores["value_of_filter"] == pytest.approx(scores["value_loss"]) and scores["value_loss"] > 1.0
-    assert 0.0 < scores["value_of_abstaining"] <= scores["value_of_filter"] + 1e-9
+    assert scores["value_of_abstaining"] == pytest.approx(scores["value_of_filter"])
+
+
+def test_probabilities_too_large_and_too_small_do_not_cancel() -> None:
+    """Ten bins: 0.05 and 0.09 share the first, 0.15 and 0.95 have one each, and so has 1 with 0.95."""
+    held = np.array([0.05, 0.09, 0.15, 0.95, 1.0])
+    true = np.array([0.15, 0.01, 0.65, 0.35, 1.0])
+    weights = np.array([1.0, 1.0, 2.0, 3.0, 3.0])
+    expected = (abs(-0.10 + 0.08) + 2.0 * 0.50 + 3.0 * 0.60) / 10.0
+    assert calibration_error(held, true, weights) == pytest.approx(expected)
 
 
 def test_rewards_and_ends_are_judged_as_outcomes() -> None:

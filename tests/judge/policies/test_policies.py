@@ -10,7 +10,7 @@ import math
 import numpy as np
 import pytest
 from imagine_bench.agents.world_models.limits import Exact
-from judged import STILL, judged_world
+from judged import STILL, Altered, judged_world
 from scipy.stats import kendalltau
 
 from imagine_bench import registry
@@ -18,7 +18,7 @@ from imagine_bench.arrays import Floats
 from imagine_bench.exact.values import NEVER, Model, values_of_planning
 from imagine_bench.interfaces import Outcome, State
 from imagine_bench.interfaces.episodes import Episodes
-from imagine_bench.interfaces.model import WorldModel
+from imagine_bench.interfaces.model import Imagined, WorldModel
 from imagine_bench.judge.policies import levels
 from imagine_bench.judge.policies.agreement import DenseModel, kendall, pearson, values_of
 from imagine_bench.judge.policies.exploit import largest_exploit, upper_bound
@@ -127,6 +127,21 @@ def test_copy_overrates_just_what_enumeration_says() -> None:
     assert all(math.isnan(found[name]) for name in SCORES), "it predicts no rewards"
 
 
+def test_a_film_shows_the_outcomes_that_a_model_imagines() -> None:
+    """Of one that imagines the right macrostates, and expects a reward that is too large by 1."""
+    judged = judged_world(ARROWS)
+
+    def hopeful(found: Imagined, *_: object) -> Imagined:
+        return dataclasses.replace(found, rewards=np.asarray(found.rewards) + 1.0)
+
+    found, film = scores_of(ARROWS, Altered(judged, hopeful))
+    assert film is not None and len(film.real) == world_of(ARROWS).horizon
+    expected = [(action, outcome._replace(reward=outcome.reward + 1.0)) for action, outcome in film.real]
+    assert list(film.believed) == expected
+    assert len({step.outcome.reached for step in film.real} | {film.start}) > 1
+    assert film.returns[0] - film.returns[1] == pytest.approx(found["exploit"]) == len(film.real)
+
+
 def test_no_level_lacks_a_score_and_no_score_a_column() -> None:
     assert [level.name for level in LEVELS] == [f"L{number}" for number in range(8)]
     measures = {name for level in LEVELS for name in level.measures}
@@ -211,6 +226,27 @@ def test_a_whole_table_plans_as_the_truth_an_empty_one_never_tries() -> None:
     half = counted_table(episodes, macrostates, 2, world)
     assert (half.reward == NEVER).sum() == count - 2
     assert half.reward[0, :2] == pytest.approx(truth.reward[0, :2])
+
+
+def test_a_table_holds_shares_of_outcomes_and_mean_rewards() -> None:
+    """Of the first transitions of two episodes, across which none leads; one pair was tried twice."""
+    world = world_of(ARROWS)
+    (one, other), width = world.states[:2], len(world.states)
+    episodes = Episodes(
+        lengths=np.array([2, 2]),
+        frames=np.zeros((6, 64, 64, 3), dtype=np.uint8),
+        action_masks=np.ones((6, world.truth.reward.shape[1]), dtype=np.int8),
+        actions=np.array([0, 1, 0, 2]),
+        rewards=np.array([1.0, 5.0, 4.0, 7.0]),
+        terminated=np.array([False, True, False, False]),
+        truncated=np.array([False, False, False, True]),
+        success=np.zeros(2, dtype=bool),
+    )
+    table = counted_table(episodes, np.array([one, other, one, one, one, other]), 3, world)
+    tried = {pair: table.reward[pair] for pair in zip(*np.nonzero(table.reward > NEVER), strict=True)}
+    assert tried == {(0, 0): 2.5, (1, 1): 5.0}
+    assert table.following[0, 0].tolist() == list(range(width + 1))
+    assert table.p_continues[0, 0, :2].tolist() == [0.5, 0.5] and table.p_continues.sum() == 1.0
 
 
 @WORLDS
