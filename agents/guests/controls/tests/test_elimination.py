@@ -109,6 +109,12 @@ def test_the_unknown_is_worth_the_largest_reward_and_nothing_in_tests() -> None:
     drawn = {agent.act(here, explore=True) for _ in range(20)}
     assert drawn == {0, 1}, "the untried action may bring as much as the best one seen"
     assert agent.act(here, explore=False) == 0
+    before = Transition(
+        observation=seen((2,)), action=1, reward=-1.0, next_observation=here, terminated=False, truncated=False
+    )
+    agent.observe(before, episode=1)
+    discount = agent.settings.controller.discount
+    assert discount < 1.0 and agent.q_values(seen((2,))).tolist() == pytest.approx([0.0, 5.0 * discount - 1.0])
 
 
 def test_it_solves_every_start_within_150_macro_actions() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import fake_codes
 import numpy as np
 import pytest
@@ -131,6 +133,21 @@ def test_directed_exploration_ends_in_greedy_actions() -> None:
         following, reward, ended = fake_codes.step(starts()[row], action)
         assert (told.reward[row, action], told.p_continues[row, action].tolist()) == (reward, [1.0 - ended])
         assert ended or told.macrostates[row, action].tolist() == [list(following)]
+
+
+def test_an_action_has_as_many_expected_outcomes_as_were_seen() -> None:
+    """Half of the time the second wheel turns on, a quarter back, which ends it or does not."""
+    settings = HYPERPARAMETERS.resolve("fast", {}, "chapter_5")
+    learner, here = CodeCountTableAgent(PERCEPTION, ACTIONS, settings, SeedTree(0), directed=False), (0, 1, 0)
+    for then, reward, ended in (((0, 2, 0), 4.0, False), ((0, 0, 0), -4.0, True), ((0, 0, 0), 0.0, False)) * 3:
+        next_observation = Observation(frame=frame(then))
+        one = replace(fake_codes.transition(here, 2), next_observation=next_observation, reward=reward, terminated=ended)
+        for _ in range(1 + (reward > 0.0)):
+            learner.observe(one, episode=0)
+    told = learner.predict_outcomes(frame(here)[None], np.random.default_rng(0))
+    assert told.p_continues[0].tolist() == [[0.0, 0.0], [0.0, 0.0], [0.5, 0.25], [0.0, 0.0]]
+    assert told.macrostates[0, 2].tolist() == [[0, 2, 0], [0, 0, 0]]
+    assert told.reward.tolist() == [[0.0, 0.0, 1.0, 0.0]]
 
 
 @pytest.mark.parametrize(("discount", "best"), [(0.5, 10.0), (1.0, 5000.0)])

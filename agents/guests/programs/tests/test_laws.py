@@ -13,6 +13,7 @@ import pytest
 from imagine_bench_programs import __main__ as commands
 from imagine_bench_programs.__main__ import written
 from imagine_bench_programs.agent import LawsAgent, ProgramAgent
+from imagine_bench_programs.model import SymbolModel
 from imagine_bench_programs.program import Program
 from imagine_bench_programs.seeing import Hidden, hidden_value, still_value
 from imagine_bench_programs.symbols import Symbols
@@ -398,21 +399,14 @@ class ByteSymbols(Symbols):
     def macrostates(self, states: Sequence[State]) -> NDArray[np.int64]:
         return np.array(states) + 10
 
-
-class LateSymbols(ByteSymbols):
-    """The code of a frame is its first byte."""
-
-    def __init__(self) -> None:
-        self.sizes = (5,)
-
-    def read(self, frames: Frame) -> list[State]:
-        return [(each,) for each in frames[:, 0, 0, 0].tolist()]
+    def images(self, states: Sequence[State]) -> NDArray[np.uint8]:
+        return np.array(states, dtype=np.uint8)[:, None]
 
 
 def test_the_agent_tells_its_writer_that_an_episode_begins() -> None:
     """Else the first plan would begin after macro-actions of the episode before, which no frame will show."""
     context = AgentContext(n_actions=2, preprocessing="none", encoder=None, seeds=SeedTree(0))
-    agent = LawsAgent(LateSymbols(), context)
+    agent = LawsAgent(ByteSymbols((5,)), context)
     for each in late(1, episodes=40):
         agent.writer.learn(each)
     start = Observation(frame=np.full((64, 64, 3), 2, dtype=np.uint8))
@@ -455,6 +449,11 @@ def test_what_a_program_remembers_goes_with_the_state_until_the_episode_ends(tmp
     for _ in range(2):
         agent.begin_episode()
         assert [agent.act(seen, explore=False) for _ in range(3)] == [1, 0, 1]
+    shown = np.zeros((1, 2, 64, 64, 3), dtype=np.uint8)
+    shown[0, 1] = 1
+    for frames, actions in ((shown, [[0, 0]]), (shown[:, 1:], [[1, 0]])):  # a step of memory is shown, or imagined
+        found = SymbolModel(ByteSymbols((2,)), counts).imagine(frames, np.array(actions), 1, np.random.default_rng(0))
+        assert found.rewards is not None and found.rewards[0, 0, -1] == found.p_ended[0, 0, -1] == 1.0
 
 
 def test_an_agent_plans_from_its_macro_actions_of_this_episode_alone() -> None:
