@@ -138,10 +138,14 @@ def test_who_imagines_what_frames_will_show_is_right(task: str, depth: int) -> N
 def test_examples_and_samples_go_as_imagined() -> None:
     spec = labelled("pick_place:gesture=first")
     agent = Perfect(spec)
-    found = examples(agent, spec, appearance="clean", seeds=SeedTree(0))
-    found += imagine_sampled_rollouts(agent, spec, appearance="clean", seeds=SeedTree(0))
-    assert len(found) == EXAMPLES + SAMPLED_ROLLOUTS
-    for each in found:  # chance goes as was imagined, as far as frames tell
+    none, sampled = (
+        imagine_sampled_rollouts(who, each, appearance="clean", seeds=SeedTree(0))
+        for who, each in ((IMAGINER, PUZZLE), (agent, spec))
+    )
+    assert (len(none), len(sampled)) == (0, SAMPLED_ROLLOUTS), "only a task with chance has some"
+    assert len({(each.start_frame.tobytes(), tuple(each.start_macrostate.tolist())) for each in sampled}) == 1
+    for each in (*examples(agent, spec, appearance="clean", seeds=SeedTree(0)), *sampled):
+        # chance goes as was imagined, as far as frames tell
         until = int(each.real_terminated.argmax()) if each.real_terminated.any() else len(each.real_terminated)
         assert np.array_equal(each.real_macrostates[:until], each.rollout.macrostates[:until])
 
@@ -192,15 +196,6 @@ def test_reality_goes_as_was_imagined_late_where_frames_are_late() -> None:
             rollout = IMAGINER.imagine(frame, actions=np.zeros(2, dtype=np.int64), depth=9, rng=rng)
             real = moment.beside(dataclasses.replace(rollout, macrostates=np.array([START, wish])), rng)
             assert real.real_macrostates.tolist() == [list(START), list(wish)]
-
-
-def test_only_a_task_with_chance_has_sampled_rollouts() -> None:
-    none, sampled = (
-        imagine_sampled_rollouts(IMAGINER, spec, appearance="clean", seeds=SeedTree(0)) for spec in (PUZZLE, PICK_PLACE)
-    )
-    assert (len(none), len(sampled)) == (0, SAMPLED_ROLLOUTS)
-    assert len({each.start_frame.tobytes() for each in sampled}) == 1
-    assert len({tuple(each.start_macrostate.tolist()) for each in sampled}) == 1
 
 
 class _Coin:

@@ -235,14 +235,6 @@ def test_drawing_and_probabilistic_models_are_comparable(mistaken: float) -> Non
         assert mean["perfect_by_depth"][0] == pytest.approx(0.117, abs=0.001)
 
 
-def test_a_brier_score_is_a_mean_over_questions() -> None:
-    """Half of the probability on the truth, half on an impossible outcome: 1/4 + 1/4 a question."""
-    world = judged_world(ARROWS)
-    scores = world.scores(giving(world, 0.5))
-    assert scores["outcome_brier"] == scores["unbiased"] == pytest.approx(0.5)
-    assert scores["total_variation"] == pytest.approx(0.5)
-
-
 def mistaken(world: JudgedWorld, wrong: Collection[tuple[State, int]]) -> Altered:
     """Says of some transitions that nothing comes; it is unsure of those alone."""
 
@@ -269,7 +261,7 @@ def test_known_mistakes_are_charged_exactly() -> None:
     share = len(wrong) / len(pairs)
     for name in ("total_variation", "missed", "hallucinated", "outcome_ece"):
         assert scores[name] == pytest.approx(share)
-    assert scores["outcome_brier"] == pytest.approx(2 * share)
+    assert scores["outcome_brier"] == scores["unbiased"] == pytest.approx(2 * share), "a mean over questions"
     assert wrong == {pairs[row // FRAMES] for row in scores["worst"][: FRAMES * len(wrong)]}
     assert scores["auroc_wrong"] == scores["best_skill"] == scores["filter_skill"] == 1.0
     rows, count = FRAMES * len(wrong), FRAMES * len(pairs)
