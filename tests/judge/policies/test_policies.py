@@ -14,7 +14,7 @@ from judged import STILL, Altered, judged_world
 from scipy.stats import kendalltau
 
 from imagine_bench import registry
-from imagine_bench.arrays import Floats
+from imagine_bench.arrays import Bools, Floats, Ints
 from imagine_bench.exact.values import NEVER, Model, values_of_planning
 from imagine_bench.interfaces import Outcome, State
 from imagine_bench.interfaces.episodes import Episodes
@@ -196,6 +196,16 @@ def test_a_course_ends_with_the_episode_the_plan_or_the_known_world(reached: Sta
 # Lift --------------------------------------------------------------------------------------------------------------
 
 
+def lived(lengths: Ints, actions: Ints, rewards: Floats, terminated: Bools, truncated: Bools) -> Episodes:
+    """Episodes of the puzzle without anything to see."""
+    rows = len(actions) + len(lengths)
+    masks = np.ones((rows, judged_world(ARROWS).spec.n_actions), dtype=np.int8)
+    return Episodes(
+        lengths=lengths, frames=np.zeros((rows, 64, 64, 3), dtype=np.uint8), action_masks=masks, actions=actions,
+        rewards=rewards, terminated=terminated, truncated=truncated, success=np.zeros(len(lengths), dtype=bool),
+    )  # fmt: skip
+
+
 def test_a_whole_table_plans_as_the_truth() -> None:
     """Episodes of one transition each, in a world without chance."""
     world = world_of(ARROWS)
@@ -205,16 +215,8 @@ def test_a_whole_table_plans_as_the_truth() -> None:
     after = truth.following[..., 0].ravel().clip(max=len(world.states))
     macrostates = known[np.stack([before, after], axis=1).ravel()]
     ends = truth.p_continues.sum(axis=2).ravel() < 0.5
-    episodes = Episodes(
-        lengths=np.ones(count, dtype=np.int64),
-        frames=np.zeros((2 * count, 64, 64, 3), dtype=np.uint8),
-        action_masks=np.ones((2 * count, truth.reward.shape[1]), dtype=np.int8),
-        actions=np.tile(np.arange(truth.reward.shape[1]), len(world.states)),
-        rewards=truth.reward.ravel(),
-        terminated=ends,
-        truncated=~ends,
-        success=np.zeros(count, dtype=bool),
-    )
+    actions = np.tile(np.arange(truth.reward.shape[1]), len(world.states))
+    episodes = lived(np.ones(count, dtype=np.int64), actions, truth.reward.ravel(), ends, ~ends)
     best_return = world.starts @ values_of_planning(truth, truth, world.horizon)
     tables = tabulate(judged_world(ARROWS).spec.rules)
     assert best_return == pytest.approx(horizon_optimum(tables, world.horizon).returns[tables.starts].mean())
@@ -227,16 +229,8 @@ def test_a_table_holds_shares_of_outcomes_and_mean_rewards() -> None:
     """Of the first transitions of two episodes, across which none leads; one pair was tried twice, others NEVER."""
     world = world_of(ARROWS)
     (one, other), width = world.states[:2], len(world.states)
-    episodes = Episodes(
-        lengths=np.array([2, 2]),
-        frames=np.zeros((6, 64, 64, 3), dtype=np.uint8),
-        action_masks=np.ones((6, world.truth.reward.shape[1]), dtype=np.int8),
-        actions=np.array([0, 1, 0, 2]),
-        rewards=np.array([1.0, 5.0, 4.0, 7.0]),
-        terminated=np.array([False, True, False, False]),
-        truncated=np.array([False, False, False, True]),
-        success=np.zeros(2, dtype=bool),
-    )
+    ends = np.arange(4) == np.array([[1], [3]])
+    episodes = lived(np.array([2, 2]), np.array([0, 1, 0, 2]), np.array([1.0, 5.0, 4.0, 7.0]), *ends)
     table = counted_table(episodes, np.array([one, other, one, one, one, other]), 3, world)
     tried = {pair: table.reward[pair] for pair in zip(*np.nonzero(table.reward > NEVER), strict=True)}
     assert tried == {(0, 0): 2.5, (1, 1): 5.0}
