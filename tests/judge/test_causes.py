@@ -100,7 +100,7 @@ def test_what_was_never_experienced_is_charged_to_experience() -> None:
     assert cause(does(OPTIMAL, None), odd, FAILED) == "unexperienced"
 
 
-def test_what_a_model_expects_rightly_is_a_share_of_each_macro_action() -> None:
+def test_a_model_expects_a_share_of_each_macro_action_rightly() -> None:
     """It knows no slips, and of some pairs it expects an end that never comes."""
     spec, never = (registry.task(f"arrows:cubes=2,slip={slip}") for slip in (0.25, 0.0))
     states = states_of(spec.rules)

@@ -196,7 +196,8 @@ def test_the_recording_shows_the_same_plans_and_the_arm_moves(
         (
             {"accepts": False},
             None,
-            "the agent's filter discards macro-action 1 (epistemic uncertainty of the state 0, probability of the end 0.1)",
+            "the agent's filter discards macro-action 1 "
+            "(epistemic uncertainty of the state 0, probability of the end 0.1)",
         ),
         ({"accepts": False, "uncertainty": 0.9}, 1.0, ""),  # the bound replaces the agent's own filter
         ({"uncertainty": 0.9}, 0.5, "epistemic uncertainty 0.9 at macro-action 3 is above 0.5"),

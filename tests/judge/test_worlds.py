@@ -351,7 +351,7 @@ def test_the_hamming_distance_counts_edges_under_any_names() -> None:
     more = LearnedGraph(values=np.column_stack([renamed, np.ones(len(states), dtype=np.int64)]), edges=wide)
     assert hamming_distance(more, edges, states) == 1
     blank = LearnedGraph(values=np.ones((8 * len(states), 1), dtype=np.int64), edges=np.ones((len(edges), 1, 1), bool))
-    assert hamming_distance(blank, edges, np.repeat(states, 8, axis=0)) == edges.sum() + len(edges), "it is no coordinate"
+    assert hamming_distance(blank, edges, np.repeat(states, 8, axis=0)) == edges.sum() + len(edges), "no coordinate"
     assert require_graph(learned, name="it", rows=len(states), n_actions=rules.n_actions) is learned
     for wrong in (dataclasses.replace(learned, edges=wide), dataclasses.replace(learned, values=states[:3])):
         with pytest.raises(InvalidValueError, match=r"World model it: factor_graph\(\) gave .*; give "):

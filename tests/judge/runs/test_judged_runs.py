@@ -145,7 +145,7 @@ def test_runs_that_cannot_be_judged_say_why(runs: dict[str, Path], tmp_path: Pat
 
 
 @pytest.mark.usefixtures("own_names")
-def test_modules_of_the_truth_are_closed_to_all_but_their_own_package() -> None:
+def test_the_truths_modules_are_closed_to_other_packages() -> None:
     """Also to a package whose name begins alike."""
     entry = dataclasses.replace(registry.task_entry("arrow_puzzle"), spec="theirs.rules:SPEC", env="theirs.worlds:Env")
     registry.TASKS["their_task"] = entry

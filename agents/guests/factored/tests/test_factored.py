@@ -100,7 +100,7 @@ def test_by_chance_imagined_factors_change_independently() -> None:
     assert np.abs(between - np.eye(len(between))).max() < 0.25
 
 
-def test_a_learned_graph_has_an_edge_from_each_parent_to_its_child() -> None:
+def test_a_learned_graph_has_an_edge_from_parent_to_child() -> None:
     """Action 0 turns the first wheel if the lamp is lit, 1 the second if the first is at 2, 2 the lamp; 3 nothing."""
     model, codes = structured(), list(itertools.product(*map(range, SIZES)))
     for code in codes:

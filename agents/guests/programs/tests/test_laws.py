@@ -430,7 +430,7 @@ def test_what_a_program_remembers_goes_with_the_state_until_the_episode_ends(tmp
         assert found.rewards is not None and found.rewards[0, 0, -1] == found.p_ended[0, 0, -1] == 1.0
 
 
-def test_plans_begin_after_the_macro_actions_of_this_episode_alone() -> None:
+def test_plans_begin_after_the_macro_actions_of_this_episode() -> None:
     """Frames are a macro-action late. The second macro-action ends the episode from 2, the first one from 4."""
     context = AgentContext(n_actions=2, preprocessing="none", encoder=None, seeds=SeedTree(0))
     agent = LawsAgent(ByteSymbols((5,)), context)

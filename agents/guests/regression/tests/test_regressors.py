@@ -116,7 +116,7 @@ def test_variances_are_those_of_what_weight_samples_draw(name: str) -> None:
     assert len(np.unique(drawn)) == drawn.size
 
 
-def test_the_first_batches_count_equally_and_later_ones_by_a_hundredth() -> None:
+def test_batches_count_equally_at_first_and_later_a_hundredth() -> None:
     network = NormedMLP((2, 4, 1), generators=[generator()], dropout=0.0)
     x, _ = data(3)
     for batch in x:

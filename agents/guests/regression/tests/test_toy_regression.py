@@ -45,7 +45,7 @@ def test_noise_is_three_times_as_large_in_the_noisy_region_only() -> None:
     np.testing.assert_array_equal(toy.noise_sigma("base", x), np.ones(5))
 
 
-def test_the_true_uncertainties_are_those_of_the_curves_and_of_the_noise() -> None:
+def test_the_true_uncertainties_are_of_the_curves_and_the_noise() -> None:
     """Beside networks of which each value drawn is 5: the error is the bias, the distance of the curves, the noise."""
 
     def predict(inputs: np.ndarray, purpose: str) -> Prediction:
