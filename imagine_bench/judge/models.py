@@ -279,7 +279,7 @@ def closed_modules(task: str, make: str) -> list[str]:
     entry = registry.task_entry(task)
     others = {target.partition(":")[0] for target in (entry.spec, entry.env)}
     package = make.partition(":")[0].partition(".")[0]
-    return [_TASKS, *sorted(module for module in others if module.partition(".")[0] not in (package, __package__))]
+    return [_TASKS, *sorted(module for module in others if module.partition(".")[0] != package)]
 
 
 def runs_of(model: str) -> dict[int, Path]:

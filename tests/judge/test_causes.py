@@ -3,17 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
+import math
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from imagine_bench import registry
 from imagine_bench.exact.values import true_model
 from imagine_bench.interfaces import Outcome, State, TaskSpec
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes
-from imagine_bench.judge.causes import CAUSES, Attribution, FailedEpisode, drawn_by, memory_suffices, place
+from imagine_bench.judge.causes import (
+    CAUSES,
+    Attribution,
+    FailedEpisode,
+    drawn_by,
+    expected_rightly,
+    memory_suffices,
+    place,
+)
 from imagine_bench.rules import fewest_actions, states_of
 from imagine_bench.store.results import PolicyTable
 
@@ -87,6 +98,21 @@ def test_what_was_never_experienced_is_charged_to_experience() -> None:
     assert cause(does(dict.fromkeys(STATES, 0), model_of(SPEC)), NONE, FAILED) == "planning", "the model needs no more"
     odd = np.array([[9, 9, 9, 9, 0]])  # a scene that was no macrostate
     assert cause(does(OPTIMAL, None), odd, FAILED) == "unexperienced"
+
+
+def test_a_model_expects_a_share_of_each_macro_action_rightly() -> None:
+    """It knows no slips, and of some pairs it expects an end that never comes."""
+    spec, never = (registry.task(f"arrows:cubes=2,slip={slip}") for slip in (0.25, 0.0))
+    states = states_of(spec.rules)
+
+    def wrong(state: State, action: int) -> bool:
+        return sum(state) % 2 == 0 and not any(each.terminated for each in spec.rules.outcomes(state, action))
+
+    pairs = itertools.product([each for each in states if not spec.rules.is_terminal(each)], range(spec.n_actions))
+    share = np.mean([wrong(*pair) for pair in pairs])
+    held, without = (does(dict.fromkeys(states, 0), model, states) for model in (model_of(never, wrong), None))
+    assert expected_rightly(spec.rules, held) == pytest.approx(0.75 * (1.0 - share)) and 0.1 < share < 0.9
+    assert math.isnan(expected_rightly(spec.rules, without))
 
 
 def test_a_start_from_which_no_plan_fits_is_unlucky() -> None:

@@ -138,10 +138,14 @@ def test_who_imagines_what_frames_will_show_is_right(task: str, depth: int) -> N
 def test_examples_and_samples_go_as_imagined() -> None:
     spec = labelled("pick_place:gesture=first")
     agent = Perfect(spec)
-    found = examples(agent, spec, appearance="clean", seeds=SeedTree(0))
-    found += imagine_sampled_rollouts(agent, spec, appearance="clean", seeds=SeedTree(0))
-    assert len(found) == EXAMPLES + SAMPLED_ROLLOUTS
-    for each in found:  # chance goes as was imagined, as far as frames tell
+    none, sampled = (
+        imagine_sampled_rollouts(who, each, appearance="clean", seeds=SeedTree(0))
+        for who, each in ((IMAGINER, PUZZLE), (agent, spec))
+    )
+    assert (len(none), len(sampled)) == (0, SAMPLED_ROLLOUTS), "only a task with chance has some"
+    assert len({(each.start_frame.tobytes(), tuple(each.start_macrostate.tolist())) for each in sampled}) == 1
+    for each in (*examples(agent, spec, appearance="clean", seeds=SeedTree(0)), *sampled):
+        # chance goes as was imagined, as far as frames tell
         until = int(each.real_terminated.argmax()) if each.real_terminated.any() else len(each.real_terminated)
         assert np.array_equal(each.real_macrostates[:until], each.rollout.macrostates[:until])
 
@@ -165,42 +169,26 @@ def test_examples_stand_beside_the_truth() -> None:
     assert len(PICK_PLACE.rules.start_states) < EXAMPLES == len(few) == len(first), "few starts have examples too"
 
 
-def test_reality_goes_as_was_imagined_where_it_may() -> None:
-    """Picking the left object. By luck, twenty draws would not all be the imagined one (3e-10)."""
+@pytest.mark.parametrize("lag", [0, 1])
+def test_reality_goes_as_was_imagined_where_it_may(lag: int) -> None:
+    """Picking the left object, which late frames show late. By luck, ten draws would not all be the imagined one."""
     frame = np.zeros((64, 64, 3), dtype=np.uint8)
-    moment = Moment(spec=PICK_PLACE, appearance="clean", frame=frame, macrostate=START)
+    spec = labelled("pick_place:lag=1") if lag else PICK_PLACE
+    moment = Moment(spec=spec, appearance="clean", frame=frame, macrostate=START)
 
     def reached(wish: State, draws: int) -> set[State]:
         found = set()
         for rng in map(np.random.default_rng, range(draws)):
-            rollout = IMAGINER.imagine(frame, actions=np.zeros(1, dtype=np.int64), depth=9, rng=rng)
-            real = moment.beside(dataclasses.replace(rollout, macrostates=np.array([wish])), rng)
-            found.add(tuple(real.real_macrostates[0]))
+            rollout = IMAGINER.imagine(frame, actions=np.zeros(1 + lag, dtype=np.int64), depth=9, rng=rng)
+            imagined = np.array([START, wish][1 - lag :])
+            real = moment.beside(dataclasses.replace(rollout, macrostates=imagined), rng).real_macrostates
+            assert real[:lag].tolist() == [list(START)] * lag
+            found.add(tuple(real[lag]))
         return found
 
     for wish in (ASKS_MIDDLE, ASKS_RIGHT):
         assert reached(wish, 10) == {wish}
     assert reached(IMPOSSIBLE, 30) == {outcome.macrostate for outcome in PICK_PLACE.rules.outcomes(START, 0)}
-
-
-def test_reality_goes_as_was_imagined_late_where_frames_are_late() -> None:
-    late = labelled("pick_place:lag=1")
-    frame = np.zeros((64, 64, 3), dtype=np.uint8)
-    moment = Moment(spec=late, appearance="clean", frame=frame, macrostate=START)
-    for wish in (ASKS_MIDDLE, ASKS_RIGHT):
-        for rng in map(np.random.default_rng, range(10)):
-            rollout = IMAGINER.imagine(frame, actions=np.zeros(2, dtype=np.int64), depth=9, rng=rng)
-            real = moment.beside(dataclasses.replace(rollout, macrostates=np.array([START, wish])), rng)
-            assert real.real_macrostates.tolist() == [list(START), list(wish)]
-
-
-def test_only_a_task_with_chance_has_sampled_rollouts() -> None:
-    none, sampled = (
-        imagine_sampled_rollouts(IMAGINER, spec, appearance="clean", seeds=SeedTree(0)) for spec in (PUZZLE, PICK_PLACE)
-    )
-    assert (len(none), len(sampled)) == (0, SAMPLED_ROLLOUTS)
-    assert len({each.start_frame.tobytes() for each in sampled}) == 1
-    assert len({tuple(each.start_macrostate.tolist()) for each in sampled}) == 1
 
 
 class _Coin:

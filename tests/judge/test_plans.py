@@ -192,16 +192,22 @@ def test_the_recording_shows_the_same_plans_and_the_arm_moves(
 @pytest.mark.parametrize(
     ("dreams", "bound", "words"),
     [
-        ({"uncertainty": 0.9}, 0.3, "is above 0.3"),
-        ({"accepts": False}, None, "discards macro-action 1 (epistemic uncertainty of the state 0, probability of"),
+        ({"uncertainty": 0.9}, 0.3, "epistemic uncertainty 0.45 at macro-action 2 is above 0.3"),
+        (
+            {"accepts": False},
+            None,
+            "the agent's filter discards macro-action 1 "
+            "(epistemic uncertainty of the state 0, probability of the end 0.1)",
+        ),
         ({"accepts": False, "uncertainty": 0.9}, 1.0, ""),  # the bound replaces the agent's own filter
-        ({"uncertainty": 0.9}, 0.0, "is above 0"),
+        ({"uncertainty": 0.9}, 0.5, "epistemic uncertainty 0.9 at macro-action 3 is above 0.5"),
+        ({"uncertainty": 0.9}, 0.0, "epistemic uncertainty 0.45 at macro-action 2 is above 0"),
         ({"accepts": False, "uncertainty": 0.0}, 0.0, ""),
     ],
 )
 def test_an_uncertain_plan_is_refused_and_says_so(dreams: dict[str, Any], bound: float | None, words: str) -> None:
-    plan = next(plan for plan in carried_out(optimal(**dreams), 8, max_epistemic=bound) if plan.length > 1)
-    assert words in plan.refused and bool(words) == bool(plan.refused) != plan.solved
+    plan = next(plan for plan in carried_out(optimal(**dreams), 8, max_epistemic=bound) if plan.length == 3)
+    assert plan.refused == words and bool(words) != plan.solved
     assert plan.done == (0 if words else plan.length) and summarise([plan])["refused"] == bool(words)
     assert plan.outcome.startswith("refused: " if words else "solved")
 

@@ -16,7 +16,14 @@ from imagine_bench.interfaces import Frame, Rules, State
 from imagine_bench.interfaces.model import Imagined, WorldModel
 from imagine_bench.judge import questions
 from imagine_bench.judge.questions import FRAMES
-from imagine_bench.judge.scores import after_the_end_scores, by_depth, filter_scores, one_step_scores, ranking_scores
+from imagine_bench.judge.scores import (
+    after_the_end_scores,
+    by_depth,
+    calibration_error,
+    filter_scores,
+    one_step_scores,
+    ranking_scores,
+)
 
 ERRORS = (
     *("total_variation", "missed", "hallucinated", "unreadable", "outcome_ece", "outcome_brier", "reward_error"),
@@ -228,14 +235,6 @@ def test_drawing_and_probabilistic_models_are_comparable(mistaken: float) -> Non
         assert mean["perfect_by_depth"][0] == pytest.approx(0.117, abs=0.001)
 
 
-def test_a_brier_score_is_a_mean_over_questions() -> None:
-    """Half of the probability on the truth, half on an impossible outcome: 1/4 + 1/4 a question."""
-    world = judged_world(ARROWS)
-    scores = world.scores(giving(world, 0.5))
-    assert scores["outcome_brier"] == scores["unbiased"] == pytest.approx(0.5)
-    assert scores["total_variation"] == pytest.approx(0.5)
-
-
 def mistaken(world: JudgedWorld, wrong: Collection[tuple[State, int]]) -> Altered:
     """Says of some transitions that nothing comes; it is unsure of those alone."""
 
@@ -262,7 +261,7 @@ def test_known_mistakes_are_charged_exactly() -> None:
     share = len(wrong) / len(pairs)
     for name in ("total_variation", "missed", "hallucinated", "outcome_ece"):
         assert scores[name] == pytest.approx(share)
-    assert scores["outcome_brier"] == pytest.approx(2 * share)
+    assert scores["outcome_brier"] == scores["unbiased"] == pytest.approx(2 * share), "a mean over questions"
     assert wrong == {pairs[row // FRAMES] for row in scores["worst"][: FRAMES * len(wrong)]}
     assert scores["auroc_wrong"] == scores["best_skill"] == scores["filter_skill"] == 1.0
     rows, count = FRAMES * len(wrong), FRAMES * len(pairs)
@@ -270,6 +269,11 @@ def test_known_mistakes_are_charged_exactly() -> None:
     assert scores["risk_coverage"] == pytest.approx(sum(uncertain) / count)
     assert (scores["filter_keeps"], scores["filter_error"]) == (pytest.approx(1.0 - share), 0.0)
     answers = world.predictions(mistaken(world, wrong), world.one_step)
+    never = {pairs[index] for index in (3, 5)}  # it is unsure of the first of them alone, and of two that were seen
+    some = one_step_scores(world.spec, world.one_step, answers, set(pairs) - never)
+    others = len(pairs) - 4
+    assert some["auroc_never"] == pytest.approx((others + 2 / 2 + others / 2) / (2 * (others + 2)))
+    assert some["auroc_either"] == pytest.approx((3 + 1 / 2) / 4)
     unknown = one_step_scores(world.spec, world.one_step, answers, None)
     assert unknown["auroc_wrong"] == 1.0
     assert math.isnan(unknown["auroc_never"]) and math.isnan(unknown["auroc_either"]), "its data are not known"
@@ -285,7 +289,16 @@ def test_the_value_of_a_filter_is_the_cost_of_mistakes() -> None:
     }
     scores = world.scores(mistaken(world, ends))
     assert scores["value_of_filter"] == pytest.approx(scores["value_loss"]) and scores["value_loss"] > 1.0
-    assert 0.0 < scores["value_of_abstaining"] <= scores["value_of_filter"] + 1e-9
+    assert scores["value_of_abstaining"] == pytest.approx(scores["value_of_filter"])
+
+
+def test_probabilities_too_large_and_too_small_do_not_cancel() -> None:
+    """Ten bins: 0.05 and 0.09 share the first, 0.15 and 0.95 have one each, and so has 1 with 0.95."""
+    held = np.array([0.05, 0.09, 0.15, 0.95, 1.0])
+    true = np.array([0.15, 0.01, 0.65, 0.35, 1.0])
+    weights = np.array([1.0, 1.0, 2.0, 3.0, 3.0])
+    expected = (abs(-0.10 + 0.08) + 2.0 * 0.50 + 3.0 * 0.60) / 10.0
+    assert calibration_error(held, true, weights) == pytest.approx(expected)
 
 
 def test_rewards_and_ends_are_judged_as_outcomes() -> None:

@@ -84,9 +84,5 @@ def test_the_truth_advances_by_hand() -> None:
     assert after[(1,), True] == pytest.approx((0.625, 0.125 * 2.0 / 0.625))
     assert after[(2,), False] == pytest.approx((0.375, -1.0))
     assert expected_reward(after) == pytest.approx(0.125 * 2.0 - 0.375)
-
-
-def test_what_is_over_stays_over_and_earns_nothing() -> None:
-    """Also where the dynamics lead on to a macrostate that ends no episode."""
-    after = advance(Toss(), {((0,), True): (1.0, 7.0)}, 0)  # type: ignore[arg-type]
-    assert after == {((1,), True): (0.25, 0.0), ((2,), True): (0.75, 0.0)}
+    over = advance(Toss(), {((0,), True): (1.0, 7.0)}, 0)  # type: ignore[arg-type]
+    assert over == {((1,), True): (0.25, 0.0), ((2,), True): (0.75, 0.0)}, "also where the dynamics lead back"

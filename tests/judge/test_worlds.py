@@ -148,22 +148,6 @@ def test_half_of_the_factors_change(task: str) -> None:
     assert (changed.sum(), (~changed).sum()) == (QUERIES // 2, QUERIES // 2)
 
 
-@TASKS
-def test_every_family_is_answered_as_by_brute_force(task: str) -> None:
-    by_hand = ByHand(task)
-    seen = set()
-    for family in by_hand.asked.families:
-        answers = family.answer(by_hand.asked.truth)
-        answers = answers[:, 1] if answers.ndim == 3 else answers  # of the second members of pairs
-        count: Callable[..., list[float]] = getattr(by_hand, family.name.replace(" ", "_").replace("-", "_"))
-        for row in range(0, len(answers), 8):
-            expected = np.array(count(family, row))
-            if len(expected):
-                seen.add(family.name)
-                np.testing.assert_allclose(answers[row], expected / expected.sum(), atol=1e-12, err_msg=family.name)
-    assert len(seen) == 8
-
-
 class Reader:
     """A person who knows the rules, and of a question only its words and images."""
 
@@ -215,18 +199,23 @@ class Reader:
 
 
 @TASKS
-def test_the_words_of_a_question_ask_for_the_answer_that_is_scored(task: str) -> None:
+def test_every_family_is_answered_as_by_brute_force(task: str) -> None:
+    """By what it asks for in numbers, and by what its words ask for."""
     by_hand = ByHand(task)
     reader = Reader(by_hand.asked.named)
+    seen = set()
     for family in by_hand.asked.families:
         answers = family.answer(by_hand.asked.truth)
+        answers = answers[:, 1] if answers.ndim == 3 else answers  # of the second members of pairs
         count: Callable[..., list[float]] = getattr(by_hand, family.name.replace(" ", "_").replace("-", "_"))
         for row in range(0, len(answers), 8):
             words = family.words(by_hand.asked.named, row)
-            expected = np.array(count(reader.understand(family.name, words[0], words[-1]), 0))
-            if len(expected):
-                exact = answers[row, 1] if answers.ndim == 3 else answers[row]
-                np.testing.assert_allclose(exact, expected / expected.sum(), atol=1e-12, err_msg=family.name)
+            for asked in ((family, row), (reader.understand(family.name, words[0], words[-1]), 0)):
+                expected = np.array(count(*asked))
+                if len(expected):
+                    seen.add(family.name)
+                    np.testing.assert_allclose(answers[row], expected / expected.sum(), atol=1e-12, err_msg=family.name)
+    assert len(seen) == 8
 
 
 @pytest.mark.parametrize("task", ["arrow_puzzle", SLIPS, "pick_place", "arrow_puzzle_easy", "arrows:cubes=4"])
@@ -350,6 +339,8 @@ def test_the_hamming_distance_counts_edges_under_any_names() -> None:
     wide[1, 4, 4] = True  # a factor that shows nothing of the macrostate
     more = LearnedGraph(values=np.column_stack([renamed, np.ones(len(states), dtype=np.int64)]), edges=wide)
     assert hamming_distance(more, edges, states) == 1
+    blank = LearnedGraph(values=np.ones((8 * len(states), 1), dtype=np.int64), edges=np.ones((len(edges), 1, 1), bool))
+    assert hamming_distance(blank, edges, np.repeat(states, 8, axis=0)) == edges.sum() + len(edges), "no coordinate"
     assert require_graph(learned, name="it", rows=len(states), n_actions=rules.n_actions) is learned
     for wrong in (dataclasses.replace(learned, edges=wide), dataclasses.replace(learned, values=states[:3])):
         with pytest.raises(InvalidValueError, match=r"World model it: factor_graph\(\) gave .*; give "):

@@ -61,7 +61,7 @@ def _information(one: Ints, other: Ints) -> float:
     joint = np.zeros((int(numbered(one).max()) + 1, int(numbered(other).max()) + 1))
     np.add.at(joint, (numbered(one), numbered(other)), 1.0 / len(one))
     entropies = (_entropy(joint.sum(axis=1)), _entropy(joint.sum(axis=0)))
-    if min(entropies) <= 0.0:
+    if min(joint.shape) == 1:
         return 0.0
     return max(0.0, sum(entropies) - _entropy(joint.ravel())) / max(entropies)
 

@@ -141,6 +141,19 @@ def test_imagine_follows_its_actions_and_its_generator() -> None:
         assert np.array_equal(greedy.actions, greedy.q_values.argmax(axis=1))
 
 
+@pytest.mark.parametrize("make", [imagination_agents.make, model_only.make])
+def test_the_mean_depth_is_that_of_one_rollout(make: Callable[..., DQN]) -> None:
+    agent = built(make, {"imagination.start_episode": 0, "imagination.breadth": 5})
+    for logit, depth in ((-99.0, 3.0), (99.0, 1.0)):
+        with torch.no_grad():
+            agent.imagination.model.head.networks[1].biases[-1].fill_(logit)
+        agent.observe(transition(0, 1, 0.0, 1), episode=5)
+        if isinstance(agent, model_only.ModelOnlyAgent):
+            agent.train_in_model()
+        found = agent.diagnostics()
+        assert (found["imagination/mean_depth"], found["imagination/acceptance_rate"]) == (depth, 1.0)
+
+
 def test_expected_outcomes_are_of_each_frame_and_macro_action() -> None:
     certain = {"imagination.temperature": 0.0, "imagination.predicts_with": "network", "model.components": 1}
     agent = built(imagination_agents.make, certain)

@@ -115,6 +115,7 @@ def test_a_single_weight_sample_cannot_be_compared() -> None:
         ("The filter", {}, True, {"dropout": 0.0}),
         ("The filter", {"weight_samples": 1}, True, {}),
         ("imagination.curiosity", {"curiosity": 0.5}, False, {"dropout": 0.0}),
+        ("imagination.confidence_scale", {"confidence_scale": 1.0}, False, {"dropout": 0.0}),
         ("imagination.reward_threshold", {"reward_threshold": 1.0}, True, {"dropout": 0.0, "members": 3}),
     ):
         with pytest.raises(InvalidValueError, match=f"^{reader} compares .* here is one. Set model.dropout above 0"):

@@ -23,24 +23,18 @@ def moments(mixtures: Mixture) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor
 
 
 @pytest.mark.parametrize(("dtype", "relative"), [(torch.float32, 1e-5), (torch.float64, 1e-12)])
-def test_the_three_causes_sum_to_the_total_predictive_variance(dtype: torch.dtype, relative: float) -> None:
-    """That of the uniform mixture over all T K components, by second moments."""
+def test_each_cause_is_its_equation(dtype: torch.dtype, relative: float) -> None:
+    """And so they sum to the variance of the uniform mixture over all T K components."""
     parts = decompose(samples(dtype))
-    weights, means, variances = (each.double() for each in moments(samples(dtype)))
-    first = (weights * means).sum(2).mean(0)
-    second = (weights * (variances + means.square())).sum(2).mean(0)
-    total = (parts.epistemic + parts.aleatoric + parts.modal).double()
-    torch.testing.assert_close(total, second - first.square(), rtol=relative, atol=0.0)
-
-
-def test_each_cause_is_its_equation() -> None:
-    mixtures = samples(torch.float64)
-    alpha, mu, var = moments(mixtures)
+    alpha, mu, var = (each.double() for each in moments(samples(dtype)))
     inner = (alpha * mu).sum(2)  # [T, N, Z]
-    parts = decompose(mixtures)
-    torch.testing.assert_close(parts.epistemic, inner.square().mean(0) - inner.mean(0).square())  # 4.25
-    torch.testing.assert_close(parts.aleatoric, (alpha * var).sum(2).mean(0))  # 4.26
-    torch.testing.assert_close(parts.modal, ((alpha * mu.square()).sum(2) - inner.square()).mean(0))  # 4.27
+    epistemic = inner.square().mean(0) - inner.mean(0).square()  # 4.25
+    aleatoric = (alpha * var).sum(2).mean(0)  # 4.26
+    modal = ((alpha * mu.square()).sum(2) - inner.square()).mean(0)  # 4.27
+    for found, expected in zip(
+        (parts.epistemic, parts.aleatoric, parts.modal), (epistemic, aleatoric, modal), strict=True
+    ):
+        torch.testing.assert_close(found.double(), expected, rtol=relative, atol=0.0)
 
 
 VALUES = torch.linspace(-2.0, 2.0, N * Z, dtype=torch.float64).view(N, Z)

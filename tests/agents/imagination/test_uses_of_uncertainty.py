@@ -151,9 +151,12 @@ def test_real_rewards_alone_are_paid_in_proportion() -> None:
 
 
 def test_the_novelty_of_a_frame_is_between_0_and_1() -> None:
-    agent, alone = (built(imagination_agents.make, {"model.dropout": share}) for share in (0.5, 0.0))
-    live(agent, range(4), np.random.default_rng(0))
-    found, nothing = (each.novelty(Observation(frame=frame(1)), np.random.default_rng(3)) for each in (agent, alone))
-    assert found is not None and len(found) == ACTIONS
-    assert 0.0 < found.min() < found.max() <= 1.0
-    assert nothing is None, "nothing differs from a single network"
+    for dropout, members in ((0.5, 1), (0.0, 3), (0.0, 1)):
+        agent = built(imagination_agents.make, {"model.dropout": dropout, "model.members": members})
+        live(agent, range(4), np.random.default_rng(0))
+        found = agent.novelty(Observation(frame=frame(1)), np.random.default_rng(3))
+        if (dropout, members) == (0.0, 1):
+            assert found is None, "nothing differs from a single network"
+        else:
+            assert found is not None and len(found) == ACTIONS
+            assert 0.0 < found.min() < found.max() <= 1.0

@@ -19,7 +19,7 @@ from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import State
 from imagine_bench.judge import judgement, questions
 from imagine_bench.judge.judgement import Judgement, data_of, judge, kept, shown
-from imagine_bench.judge.models import ModelSource, model_entry, opened, source_of
+from imagine_bench.judge.models import ModelSource, closed_modules, model_entry, opened, source_of
 from imagine_bench.judge.reading import RenderedFrameIndex
 from imagine_bench.protocols.control import protocol
 from imagine_bench.report.judge import Judged, compared, judged, judgement_page
@@ -142,6 +142,20 @@ def test_runs_that_cannot_be_judged_say_why(runs: dict[str, Path], tmp_path: Pat
     found = visited("imaginer", "arrow_puzzle")
     assert found and len(found) <= 2 * 20, "its experience is the one that the bench counted"
     assert all(len(state) == 4 and 0 <= action < 6 for state, action in found)
+
+
+@pytest.mark.usefixtures("own_names")
+def test_the_truths_modules_are_closed_to_other_packages() -> None:
+    """Also to a package whose name begins alike."""
+    entry = dataclasses.replace(registry.task_entry("arrow_puzzle"), spec="theirs.rules:SPEC", env="theirs.worlds:Env")
+    registry.TASKS["their_task"] = entry
+    own, *_ = of_suite = closed_modules("arrow_puzzle", "theirs.models:make")
+    assert own == "imagine_bench.tasks" and closed_modules("arrow_puzzle", "imagine_bench.agents.x:make") == [own]
+    assert all(module.startswith(f"{own}.") for module in of_suite[1:])
+    for make in ("others.models:make", "their.models:make", "imagine_bench.agents.x:make"):
+        assert closed_modules("their_task", make) == [own, "theirs.rules", "theirs.worlds"]
+    for make in ("theirs.models:make", "theirs:make"):
+        assert closed_modules("their_task", make) == [own]
 
 
 def test_a_run_is_judged_through_the_encoder_that_is_given(tmp_path: Path) -> None:

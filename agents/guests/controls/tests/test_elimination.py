@@ -66,13 +66,10 @@ def test_a_pair_stays_a_cause_beside_one_of_three_values() -> None:
     assert model.outcome((1, 1, 2)) == PAID
 
 
-def test_a_pair_never_seen_is_unknown_a_usual_one_is_cleared() -> None:
+def test_two_suspects_are_no_cause_until_one_is_cleared() -> None:
     model = model_of(dict.fromkeys([(0, 0, 1), (0, 1, 0), (1, 0, 0)], USUAL))
     assert model.outcome((0, 0, 0)) == USUAL, "its three pairs came with the usual outcome"
     assert model.outcome((0, 1, 1)) is None, "the values 1 and 1 never came together"
-
-
-def test_two_suspects_are_no_cause_until_one_is_cleared() -> None:
     usual = [(0, 0, 0), (0, 0, 2), (0, 2, 0), (1, 0, 2), (1, 2, 0), (2, 1, 0), (2, 0, 1), (2, 0, 0), (0, 1, 0)]
     paid = {(1, 1, 1): PAID}
     model = model_of(dict.fromkeys(usual, USUAL) | paid)
@@ -109,6 +106,12 @@ def test_the_unknown_is_worth_the_largest_reward_and_nothing_in_tests() -> None:
     drawn = {agent.act(here, explore=True) for _ in range(20)}
     assert drawn == {0, 1}, "the untried action may bring as much as the best one seen"
     assert agent.act(here, explore=False) == 0
+    before = Transition(
+        observation=seen((2,)), action=1, reward=-1.0, next_observation=here, terminated=False, truncated=False
+    )
+    agent.observe(before, episode=1)
+    discount = agent.settings.controller.discount
+    assert discount < 1.0 and agent.q_values(seen((2,))).tolist() == pytest.approx([0.0, 5.0 * discount - 1.0])
 
 
 def test_it_solves_every_start_within_150_macro_actions() -> None:

@@ -17,9 +17,9 @@ from imagine_bench_controls import swaps
 from imagine_bench_controls.settings import SWAPPING
 from imagine_bench_controls.swaps import SwappingDQN
 
+from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentContext, Observation
-from imagine_bench.running.bench import plan
 from imagine_bench.seeding import SeedTree
 
 CPU = torch.device("cpu")
@@ -48,20 +48,22 @@ def read(latents: torch.Tensor) -> list[tuple[int, ...]]:
     return [tuple(row) for row in FakeCodes().read_macrostate(latents).tolist()]
 
 
-def test_every_swap_is_as_the_world_has_it_and_some_are_new() -> None:
+@pytest.mark.parametrize("share", [1.0, 0.25])
+def test_every_swap_is_as_the_world_has_it_and_some_are_new(share: float) -> None:
     """The wheels turn alike whatever else there is, and outcomes are decided by the next code."""
-    learner = agent(**{"swaps.share": 1.0})
+    learner = agent(**{"swaps.share": share})
     tried = live(learner, 15)
-    new = set()
+    new, rows = set(), set()
     for _ in range(20):
         batch = learner.draw_batch(learner.real)
-        for before, action, after, reward, ended in zip(
-            read(batch.z), batch.action.tolist(), read(batch.next_z), batch.reward.tolist(), batch.terminated.tolist(),
-            strict=True,
-        ):  # fmt: skip
+        columns = (batch.action.tolist(), read(batch.next_z), batch.reward.tolist(), batch.terminated.tolist())
+        for row, (before, action, after, reward, ended) in enumerate(zip(read(batch.z), *columns, strict=True)):
             assert (after, reward, bool(ended)) == fake_codes.step(before, action)
-            new |= {(before, action)} - tried
+            if (before, action) not in tried:
+                new.add((before, action))
+                rows.add(row)
     assert new, "some pairs were never tried"
+    assert 0.8 * 32 * share < max(rows) < 32 * share, "the others of a batch stay real"
     assert 0.0 < learner.diagnostics()["swaps/known"] <= 1.0
 
 
@@ -120,5 +122,4 @@ def test_priorities_do_not_change_swaps() -> None:
         live(learner, 5)
         states.append({name: array.tobytes() for name, array in learner.state().arrays.items()})
     assert states[0] == states[1]
-    with pytest.raises(InvalidValueError, match=r"memory\.priority has no effect on agent dqn_swaps"):
-        plan("arrow_puzzle", "smoke", agents=("dqn_swaps:memory.priority=1",))
+    assert "memory.priority" in registry.inert_settings("dqn_swaps")

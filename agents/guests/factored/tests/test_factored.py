@@ -100,6 +100,21 @@ def test_by_chance_imagined_factors_change_independently() -> None:
     assert np.abs(between - np.eye(len(between))).max() < 0.25
 
 
+def test_a_learned_graph_has_an_edge_from_parent_to_child() -> None:
+    """Action 0 turns the first wheel if the lamp is lit, 1 the second if the first is at 2, 2 the lamp; 3 nothing."""
+    model, codes = structured(), list(itertools.product(*map(range, SIZES)))
+    for code in codes:
+        for action, turns in enumerate(np.diag([code[2], code[0] == 2, 1])):
+            following = tuple(((code + turns) % SIZES).tolist())
+            model.model.add(CodeTransition(code, action, following, 0.0, False))
+        model.model.add(CodeTransition(code, 3, code, 0.0, False))
+    model.model.outcomes.fit()
+    graph = model.factor_graph(np.stack(list(map(frame, codes))))
+    assert graph.values.tolist() == [list(code) for code in codes]
+    of_actions = [np.argwhere(edges).tolist() for edges in graph.edges]
+    assert of_actions == [[[0, 0], [0, 2]], [[1, 0], [1, 1]], [[2, 2]], []]
+
+
 def _backed_up(code: Code, action: int, values: dict[Code, float]) -> float:
     following, reward, ended = fake_codes.step(code, action)
     return reward + (0.0 if ended else 0.95 * values[following])

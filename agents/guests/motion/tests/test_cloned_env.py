@@ -112,27 +112,26 @@ def test_gymnasiums_checker_passes() -> None:
 
 
 def test_another_execution_reward_or_macro_action_is_refused() -> None:
-    """A dense reward would be that of the period of its event alone."""
-    for option, why in (
-        ("execution", "in physics; execution='dense'"),
-        ("reward", "as the rules say; leave out reward"),
+    """A dense reward would be that of the period of its event alone.
+
+    With ``told`` no frame shows the goal, and an agent of macro-actions is told no words.
+    """
+    decided = "frames show the goal; leave out"
+    for option, value, why in (
+        ("execution", "dense", "in physics; execution='dense'"),
+        ("reward", "dense", "as the rules say; leave out reward"),
+        ("told", True, f"{decided} told"),
+        ("family", "pick_place", f"{decided} family"),
+        ("control", "twist", f"{decided} control"),
+        ("observation", "human", f"{decided} observation"),
     ):
         with pytest.raises(InvalidValueError, match=why):
-            CloneExecutedEnv(**{option: "dense"})
+            CloneExecutedEnv(**{option: value})
     for action in (6, 1.5, None):
         with pytest.raises(InvalidValueError, match="from 0 to 5"):
             environment().step(action)
     with pytest.raises(InvalidValueError, match=r"call reset\(\) first"):
         CloneExecutedEnv(clone=environment().clone).step(0)
-
-
-@pytest.mark.parametrize(
-    "option", [{"told": True}, {"family": "pick_place"}, {"control": "twist"}, {"observation": "human"}]
-)
-def test_options_that_the_clone_decides_are_refused(option: dict[str, str | bool]) -> None:
-    """With ``told`` no frame shows the goal, and an agent of macro-actions is told no words."""
-    with pytest.raises(InvalidValueError, match=f"frames show the goal; leave out {next(iter(option))}"):
-        CloneExecutedEnv(**option)
 
 
 def test_another_horizon_than_that_of_the_task_is_refused() -> None:

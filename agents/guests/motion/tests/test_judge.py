@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import re
 from dataclasses import replace
@@ -45,8 +44,7 @@ FEW = MotionJudgement(task="arrow_puzzle", models=("no_change",), sizes=(3,), se
 
 def test_a_world_has_one_name_however_it_is_typed() -> None:
     one, other = (
-        dataclasses.replace(FEW, task=f"arrows:{typed}")
-        for typed in ("cubes=2,goal_change=0.1", "goal_change=0.1,cubes=2")
+        replace(FEW, task=f"arrows:{typed}") for typed in ("cubes=2,goal_change=0.1", "goal_change=0.1,cubes=2")
     )
     assert one == other
     assert one.folder_name == other.folder_name
@@ -264,7 +262,7 @@ def test_a_model_whose_code_has_changed_is_judged_anew(tmp_path: Path, monkeypat
     code = "from imagine_bench_motion.judge.interface import MotionModelEntry\n"
     code += "ENTRY = MotionModelEntry(make='theirs:Model', level='commands', description='A model.')\n"
     module = guests.write("theirs", code, {GROUP: {"theirs": "theirs:ENTRY"}}) / "theirs.py"
-    judgement = dataclasses.replace(FEW, models=("theirs", "no_change"))
+    judgement = replace(FEW, models=("theirs", "no_change"))
     for cell in judgement.cells:
         made_by = registry.package_code("theirs:Model") if cell.model == "theirs" else ""
         write_json(tmp_path / cell.file, sealed({**cell._asdict(), "questions": "1", "code": made_by}))

@@ -13,6 +13,7 @@ import pytest
 from imagine_bench_programs import __main__ as commands
 from imagine_bench_programs.__main__ import written
 from imagine_bench_programs.agent import LawsAgent, ProgramAgent
+from imagine_bench_programs.model import SymbolModel
 from imagine_bench_programs.program import Program
 from imagine_bench_programs.seeing import Hidden, hidden_value, still_value
 from imagine_bench_programs.symbols import Symbols
@@ -250,18 +251,6 @@ def test_a_macro_action_is_tried_until_it_cannot_have_failed_by_chance_alone(tri
     assert chosen == ({0, 1} if known else {1})
 
 
-def test_a_plan_begins_after_the_macro_actions_that_are_not_seen_yet() -> None:
-    writer = Writer((5,), 2, np.random.default_rng(0))
-    for each in late(1, episodes=40):
-        writer.learn(each)
-    writer.begin_episode()
-    first = writer.choose((3,), explore=False)
-    assert first == 1 or writer.laws.turned((3,), 0) == (4,)
-    (now,) = writer.laws.after((3,), [first])
-    again = writer.choose((3,), explore=False)  # the frame still shows the start
-    assert writer.laws.turned((now,), again) == (0,), "it knows where the first macro-action led"
-
-
 def test_more_macro_actions_are_another_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(commands, "_learner", lambda spec: 20.0)
     out = tmp_path / "new" / "written.json"
@@ -398,29 +387,8 @@ class ByteSymbols(Symbols):
     def macrostates(self, states: Sequence[State]) -> NDArray[np.int64]:
         return np.array(states) + 10
 
-
-class LateSymbols(ByteSymbols):
-    """The code of a frame is its first byte."""
-
-    def __init__(self) -> None:
-        self.sizes = (5,)
-
-    def read(self, frames: Frame) -> list[State]:
-        return [(each,) for each in frames[:, 0, 0, 0].tolist()]
-
-
-def test_the_agent_tells_its_writer_that_an_episode_begins() -> None:
-    """Else the first plan would begin after macro-actions of the episode before, which no frame will show."""
-    context = AgentContext(n_actions=2, preprocessing="none", encoder=None, seeds=SeedTree(0))
-    agent = LawsAgent(LateSymbols(), context)
-    for each in late(1, episodes=40):
-        agent.writer.learn(each)
-    start = Observation(frame=np.full((64, 64, 3), 2, dtype=np.uint8))
-    plans = []
-    for _ in range(2):
-        agent.begin_episode()
-        plans.append([agent.act(start, explore=False) for _ in range(2)])
-    assert plans[0] == plans[1] and plans[0][0] != plans[0][1], "the second counts the first, which is still to show"
+    def images(self, states: Sequence[State]) -> NDArray[np.uint8]:
+        return np.array(states, dtype=np.uint8)[:, None]
 
 
 def test_the_agents_expectations_are_those_of_its_laws() -> None:
@@ -455,9 +423,14 @@ def test_what_a_program_remembers_goes_with_the_state_until_the_episode_ends(tmp
     for _ in range(2):
         agent.begin_episode()
         assert [agent.act(seen, explore=False) for _ in range(3)] == [1, 0, 1]
+    shown = np.zeros((1, 2, 64, 64, 3), dtype=np.uint8)
+    shown[0, 1] = 1
+    for frames, actions in ((shown, [[0, 0]]), (shown[:, 1:], [[1, 0]])):  # a step of memory is shown, or imagined
+        found = SymbolModel(ByteSymbols((2,)), counts).imagine(frames, np.array(actions), 1, np.random.default_rng(0))
+        assert found.rewards is not None and found.rewards[0, 0, -1] == found.p_ended[0, 0, -1] == 1.0
 
 
-def test_an_agent_plans_from_its_macro_actions_of_this_episode_alone() -> None:
+def test_plans_begin_after_the_macro_actions_of_this_episode() -> None:
     """Frames are a macro-action late. The second macro-action ends the episode from 2, the first one from 4."""
     context = AgentContext(n_actions=2, preprocessing="none", encoder=None, seeds=SeedTree(0))
     agent = LawsAgent(ByteSymbols((5,)), context)
@@ -481,6 +454,9 @@ def test_an_agent_plans_from_its_macro_actions_of_this_episode_alone() -> None:
         assert [agent.act(Observation(frame=frames[3]), explore=False) for _ in range(2)] == [0, 0]
         agent.begin_episode()
         assert agent.act(Observation(frame=frames[2]), explore=False) == 1, "nothing is on its way yet"
+        agent.begin_episode()
+        both = {agent.act(Observation(frame=frames[1]), explore=False) for _ in range(2)}
+        assert both == {0, 1}, "the second begins where the first leads, which no frame shows yet"
 
 
 @pytest.mark.parametrize(("own", "experiments"), [(False, 11), (True, 10)])

@@ -62,10 +62,19 @@ class BytePerception(LearnedPerception):
         self.frame_factors = frame_factors
 
 
+def seeing(perception: LearnedPerception | None, rng: np.random.Generator) -> SeeingWriter:
+    """One that sees by this, or by a new perception."""
+    writer = SeeingWriter(registry.task("arrows:cubes=2"), "clean", rng, rng)
+    if perception is not None:
+        writer.perception = perception
+        writer.writer.take_up(perception.sizes, [])
+    return writer
+
+
 @pytest.mark.parametrize(("unknown", "first"), [(True, 111), (False, 200)])
 def test_unknown_values_bring_an_earlier_search_for_factors(unknown: bool, first: int) -> None:
     rng = np.random.default_rng(0)
-    perception = SeeingWriter(registry.task("arrows:cubes=2"), "clean", rng, rng).perception
+    perception = seeing(None, rng).perception
     perception.looked_at = 100
     perception.unknown = unknown
     perception.frames = [np.zeros((64, 64, 3), dtype=np.uint8)] * 100
@@ -78,10 +87,8 @@ def test_unknown_values_bring_an_earlier_search_for_factors(unknown: bool, first
 @pytest.mark.parametrize(("step", "keeps"), [(1, True), (2, False)])
 def test_former_factors_are_kept_where_the_new_ones_contradict(step: int, keeps: bool) -> None:
     rng = np.random.default_rng(0)
-    writer = SeeingWriter(registry.task("arrows:cubes=2"), "clean", rng, rng)
     perception = BytePerception(renews_at=12)
-    writer.perception = perception
-    writer.writer.take_up(perception.sizes, [])
+    writer = seeing(perception, rng)
     for number in range(12):  # a dial of four values that turns by one or two
         for value in (number, number + step):
             writer._images.append(np.full((64, 64, 3), value % 4, dtype=np.uint8))
@@ -114,9 +121,7 @@ class PixelPerception(LearnedPerception):
 @pytest.mark.parametrize("matters", [False, True])
 def test_a_factor_that_drifts_is_left_out_if_nothing_depends_on_it(matters: bool) -> None:
     rng = np.random.default_rng(0)
-    writer = SeeingWriter(registry.task("arrows:cubes=2"), "clean", rng, rng)
-    writer.perception = PixelPerception((3, 4))
-    writer.writer.take_up(writer.perception.sizes, [])
+    writer = seeing(PixelPerception((3, 4)), rng)
     lights = rng.integers(3, size=81)
     for number in range(81):  # a light that flips by chance, and a dial that turns
         image = np.zeros((64, 64, 3), dtype=np.uint8)
@@ -134,13 +139,11 @@ def test_a_factor_that_drifts_is_left_out_if_nothing_depends_on_it(matters: bool
 
 def test_a_superfluous_factor_is_no_reason_to_keep_those_before() -> None:
     rng = np.random.default_rng(0)
-    writer = SeeingWriter(registry.task("arrows:cubes=2"), "clean", rng, rng)
     perception = PixelPerception((3, 4, 2))
     every = perception.frame_factors
     perception.take(every._replace(factors=every.factors[1:2]), 0)
     perception.frames = []
-    writer.perception = perception
-    writer.writer.take_up(perception.sizes, [])
+    writer = seeing(perception, rng)
     for number in range(80):  # a light that flips by chance, a dial that turns, and a sign that few episodes have
         for step in range(2):
             image = np.zeros((64, 64, 3), dtype=np.uint8)

@@ -92,10 +92,14 @@ def test_variances_are_those_of_what_weight_samples_draw(name: str) -> None:
     rng = np.random.default_rng(0)
     x = rng.normal(size=(64, 1))
     curve = RegressionData(inputs=x, targets=300.0 + 50.0 * (np.sin(x) + 0.3 * rng.normal(size=(64, 1))))
-    model = regressor(name, [curve, curve], [0, 1], batch_size=32, epochs=4)
-    model.train(silent)
+    wider = RegressionData(inputs=x, targets=280.0 + 1.5 * (curve.targets - 300.0))
+    both = regressor(name, [curve, wider], [0, 1], batch_size=32, epochs=4)
+    alone = regressor(name, [wider], [1], batch_size=32, epochs=4)
+    for model in (both, alone):
+        model.train(silent)
     inputs = rng.normal(size=(2, 20, 1))
-    predicted = model.predict(inputs, rng)
+    predicted = both.predict(inputs, rng)
+    np.testing.assert_allclose(predicted.mean[1], alone.predict(inputs[1:], rng).mean[0], rtol=1e-4)
     variance = predicted.scores["total"][..., None]
     assert 10.0 < np.sqrt(variance).mean() < 250.0
     assert abs(predicted.mean.mean() - 300.0) < 100.0
@@ -112,13 +116,19 @@ def test_variances_are_those_of_what_weight_samples_draw(name: str) -> None:
     assert len(np.unique(drawn)) == drawn.size
 
 
-def test_the_first_batches_count_equally_in_running_statistics() -> None:
+def test_batches_count_equally_at_first_and_later_a_hundredth() -> None:
     network = NormedMLP((2, 4, 1), generators=[generator()], dropout=0.0)
     x, _ = data(3)
     for batch in x:
         network(batch.mT[None].contiguous(), None)
         network.update_running_stats()
-    for name, expected in (("mean", x.mean(dim=(0, 1))), ("variance", x.var(dim=1, correction=0).mean(dim=0))):
+    batches = {"mean": x.mean(dim=1), "variance": x.var(dim=1, correction=0)}
+    for name, of_each in batches.items():
+        torch.testing.assert_close(network.get_buffer(f"{name}_0")[0, :, 0], of_each.mean(dim=0))
+    network.batches = 500
+    network.update_running_stats()  # by the third of them again
+    for name, of_each in batches.items():
+        expected = 0.99 * of_each.mean(dim=0) + 0.01 * of_each[2]
         torch.testing.assert_close(network.get_buffer(f"{name}_0")[0, :, 0], expected)
 
 

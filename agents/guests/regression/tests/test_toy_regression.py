@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +12,9 @@ from imagine_bench_regression import toy_regression as toy
 from imagine_bench_regression.recordings import record_toy
 from recordings import logged
 from scipy import stats
+
+from imagine_bench.interfaces.regression import Prediction
+from imagine_bench.seeding import SeedTree
 
 
 def rng() -> np.random.Generator:
@@ -38,6 +43,25 @@ def test_noise_is_three_times_as_large_in_the_noisy_region_only() -> None:
     x = np.array([-10.1, -10.0, 0.0, 10.0, 10.1])
     np.testing.assert_array_equal(toy.noise_sigma("high_noise", x), [1, 3, 3, 3, 1])
     np.testing.assert_array_equal(toy.noise_sigma("base", x), np.ones(5))
+
+
+def test_the_true_uncertainties_are_of_the_curves_and_the_noise() -> None:
+    """Beside networks of which each value drawn is 5: the error is the bias, the distance of the curves, the noise."""
+
+    def predict(inputs: np.ndarray, purpose: str) -> Prediction:
+        shape = (*inputs.shape[:2], 1)
+        said: dict[str, Any] = {field.name: np.full(shape, 5.0) for field in dataclasses.fields(Prediction)}
+        return Prediction(**{**said, "epistemic": np.full(shape, 2.0), "drawn": np.full((*shape[:2], 300, 1), 5.0)})
+
+    found = toy.evaluate("high_noise", predict, (SeedTree(0), SeedTree(1)))
+    branches = toy.branches(found["x"])
+    mean = branches.mean(axis=1)
+    noise = np.where(np.abs(found["x"]) <= 10.0, 9.0, 1.0)
+    np.testing.assert_array_equal(found["true_aleatoric"], noise)
+    np.testing.assert_allclose(found["true_modal"], ((branches - mean[:, None]) ** 2).mean(axis=1))
+    np.testing.assert_allclose(found["true_epistemic"], np.tile((mean - 5.0) ** 2 + 2.0, (2, 1)))
+    expected = found["true_epistemic"][0] - 2.0 + found["true_modal"] + noise
+    assert (found["squared_error"] / expected).mean() == pytest.approx(1.0, abs=0.005)
 
 
 def test_a_recording_shows_standard_deviations_beside_the_true_ones(tmp_path: Path) -> None:

@@ -458,11 +458,7 @@ def fuzz(root: Path, count: int, monkeypatch: pytest.MonkeyPatch) -> set[int]:
     return statuses
 
 
-def test_a_fuzz_of_some_hundred_requests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    statuses = fuzz(tmp_path, 300, monkeypatch)
+@pytest.mark.parametrize("count", [300, pytest.param(10_000, marks=pytest.mark.slow)])
+def test_a_fuzz_of_many_requests(count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    statuses = fuzz(tmp_path, count, monkeypatch)
     assert {200, 400, 403, 404, 405} <= statuses and 500 not in statuses, statuses
-
-
-@pytest.mark.slow
-def test_a_fuzz_of_ten_thousand_requests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert 500 not in fuzz(tmp_path, 10_000, monkeypatch)
