@@ -18,6 +18,7 @@ from imagine_bench.tasks.continuous.referee import FAULT_REWARD
 from imagine_bench.tasks.continuous.segments import least_seconds, measure, move_aside
 from imagine_bench.tasks.continuous.spec import make_pick_place
 from imagine_bench.tasks.motion.orientation import about_vertical
+from imagine_bench.tasks.scenes.arm import JOINT_SPEED_LIMITS_RAD_S
 from imagine_bench.tasks.world import Reading, World
 
 from imagine_bench.arrays import Floats
@@ -40,20 +41,45 @@ def test_the_best_macro_actions_by_hand_are_one_event_each_as_ruled(family: str,
     assert event["success"]
 
 
+@pytest.mark.parametrize("rate_hz", [25.0, 12.5])
 @pytest.mark.parametrize("control", CONTROL_NAMES)
-def test_commands_keep_the_limits_of_speed_and_range(control: str) -> None:
-    env, _ = environment("arrows", control=control, **FREE["arrows"])
+def test_commands_keep_the_limits_of_speed_and_range(control: str, rate_hz: float) -> None:
+    """Actions beyond the space are those at its border; joints go their way in the period, and fingers at 0.5 m/s."""
+    env, _ = environment("arrows", control=control, rate_hz=rate_hz, **FREE["arrows"])
     rng = np.random.default_rng(0)
     low, high = env.action_space.low, env.action_space.high
-    over = True
-    for _ in range(60):
+    most_rad = np.array(JOINT_SPEED_LIMITS_RAD_S) / rate_hz
+    over, periods, gentle = True, 0, 0
+    for _ in range(40):
         if over:
             env.reset(seed=0)
+            periods = 0
         before = env.servo_targets()
-        _, _, over, _, _ = env.step(np.where(rng.random(len(low)) < 0.5, low, high))
-        joints_rad = env.servo_targets()[:7]
-        assert (np.abs(joints_rad - before[:7]) <= env.controls.most_rad + 1e-12).all()
+        action = np.where(rng.random(len(low)) < 0.5, low, high) * rng.choice([0.1, 1.0, 10.0])
+        _, _, over, _, info = env.step(action)
+        periods += 1
+        held = action.clip(low, high)
+        np.testing.assert_array_equal(env.checked(action), held)
+        joints_rad, opening_m = np.split(env.servo_targets(), [7])
+        assert (np.abs(joints_rad - before[:7]) <= most_rad + 1e-12).all()
         assert (joints_rad == joints_rad.clip(*env.model.jnt_range[:7].T)).all()
+        if control.startswith("joint"):
+            asked_rad = before[:7] + held[:7] * most_rad if control == "joint_delta" else held[:7]
+            within_rad = asked_rad.clip(before[:7] - most_rad, before[:7] + most_rad)
+            assert joints_rad == pytest.approx(within_rad.clip(*env.model.jnt_range[:7].T), abs=1e-9)
+        if control == "twist" and np.abs(held).max() < 0.2 and not info["limited"]:
+            (from_m, turn), (to_m, turned) = (env.controls.hand_pose(each) for each in (before[:7], joints_rad))
+            about = turned @ turn.T
+            turned_rad = [about[2, 1] - about[1, 2], about[0, 2] - about[2, 0], about[1, 0] - about[0, 1]]
+            moved = np.array([*(to_m - from_m), *turned_rad]) / [1.0, 1.0, 1.0, 12.0, 12.0, 12.0]
+            assert moved * rate_hz == pytest.approx(held[:6], abs=0.03)
+            gentle += 1
+        wanted_m = 0.0225 * (held[-1] + 1.0)
+        assert opening_m == pytest.approx(wanted_m.clip(before[7] - 0.5 / rate_hz, before[7] + 0.5 / rate_hz))
+        assert env.data.ctrl[env.columns.ctrl[7:]] == pytest.approx([*opening_m] * 2)
+        assert (info["sim_time_s"], info["elapsed_s"]) == pytest.approx((1.0 / rate_hz, env.data.time))
+        assert env.data.time == pytest.approx(periods / rate_hz)
+    assert gentle > 3 or control != "twist"
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -114,9 +140,10 @@ def test_a_segment_begins_with_the_hand_moved_and_turned(signs: tuple[int, ...])
     assert math.degrees(math.atan2(turn[1, 0], turn[0, 0])) == pytest.approx(15.0 * signs[3], abs=1.0)
 
 
-@pytest.mark.parametrize("cubes", range(1, 7))
-def test_any_number_of_cubes_is_turned_by_hand(cubes: int) -> None:
-    env, expert = environment("arrows", cubes=cubes, goal="0" * cubes, forbid="none")
+@pytest.mark.parametrize(("cubes", "rate_hz"), [(1, 12.5), (2, 62.5), (3, 15.625), (4, 25), (5, 125), (6, 25)])
+def test_any_number_of_cubes_is_turned_by_hand(cubes: int, rate_hz: float) -> None:
+    """With any number of commands a second."""
+    env, expert = environment("arrows", cubes=cubes, goal="0" * cubes, forbid="none", rate_hz=rate_hz)
     env.reset(seed=0, options={"macrostate": (*(1, 2, 3, 1, 2, 3)[:cubes], 0)})
     for action in (1, 2 * cubes - 2):
         assert [each["macro_action"] for each in carry_out(env, expert, action)] == [action]
