@@ -18,6 +18,7 @@ from imagine_bench.tasks.continuous.referee import FAULT_REWARD
 from imagine_bench.tasks.continuous.segments import least_seconds, measure, move_aside
 from imagine_bench.tasks.continuous.spec import make_pick_place
 from imagine_bench.tasks.motion.orientation import about_vertical
+from imagine_bench.tasks.motion.orientation import yaw_rad as yaw_of
 from imagine_bench.tasks.pick_place.scene import PALM_M
 from imagine_bench.tasks.scenes.arm import JOINT_SPEED_LIMITS_RAD_S
 from imagine_bench.tasks.scenes.objects import standing_m
@@ -332,7 +333,10 @@ def test_a_placement_moves_each_object_and_reads_as_before(
         assert aside_m == pytest.approx((*placed.world.places[info["macrostate"][-1]][:2], 0.0))
         places_m = placed.world.object_poses()[:, :2]
         off_m.append(np.abs(places_m - slots_m).max())
-        turned_rad.extend(abs(yaw_rad) for *_, yaw_rad in placed.world.places)
+        assert np.abs(places_m - slots_m - np.array(placed.world.places)[:, :2]).max() < 0.005
+        for pose, (*_, yaw_rad) in zip(placed.world.object_poses(), placed.world.places, strict=True):
+            turned_rad.append(abs(yaw_rad))
+            assert abs(math.remainder(yaw_of(*pose[3:]) - yaw_rad, math.pi / 2)) < math.radians(2.001)
         apart_m.extend(np.abs(places_m[later] - places_m[earlier]).max(axis=1))
     assert min(apart_m) >= 0.08  # a cube's edge is 55 mm
     assert 0.75 * most_m < max(off_m) < most_m + 0.005
