@@ -132,14 +132,16 @@ def test_each_lane_goes_its_own_pace_and_sees_what_it_would_alone():
     rules, rng = registry.task("arrow_puzzle").rules, np.random.default_rng(5)
     plans = [quiet_plan(rules, START, 3, rng) for _ in range(N_LANES)]
     vector = make(autoreset_mode="Disabled")
-    seen = [[frame] for frame in vector.reset(seed=7, options={"macrostate": START})[0]]
+    seen, reached = [[frame] for frame in vector.reset(seed=7, options={"macrostate": START})[0]], [START] * N_LANES
     vector.send([plan[0] for plan in plans])
     for n in (2, 2, 1, 2, 1, 1):
         frames, *_, infos = vector.recv(n)
         lanes = infos["env_id"].tolist()
-        assert infos["macrostate"].shape == (n, 4) and infos["_macrostate"].all()
         for lane, frame in zip(lanes, frames, strict=True):
+            (outcome,) = rules.outcomes(reached[lane], plans[lane][len(seen[lane]) - 1])
+            reached[lane] = outcome.macrostate
             seen[lane].append(frame)
+        assert infos["macrostate"].tolist() == [list(reached[lane]) for lane in lanes] and infos["_macrostate"].all()
         going = [lane for lane in lanes if len(seen[lane]) <= 3]
         if going:
             vector.send([plans[lane][len(seen[lane]) - 1] for lane in going], going)

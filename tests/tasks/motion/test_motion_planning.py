@@ -147,7 +147,7 @@ def test_a_motion_is_as_short_as_speed_and_effort_allow(arm):
 
 
 def test_a_command_is_ahead_by_the_lag_of_damping_and_inertia(arm):
-    """By (K_d q' + M q'') / K_p of the scene in which the arm acts, M that halfway; its fingers move, hence 0.1 mrad."""
+    """By (K_d q' + M q'') / K_p of the scene in which the arm acts, M that halfway, but for 0.1 mrad."""
     rng, model = np.random.default_rng(2), compile_arrow_scene()
     data, inertia = mujoco.MjData(model), np.empty((model.nv, model.nv))
     joints, servos = ([getattr(model, kind)(f"right_j{index}{end}") for index in range(7)] for kind, end in PARTS)

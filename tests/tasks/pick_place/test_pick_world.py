@@ -79,7 +79,7 @@ def test_motions_follow_the_rules_within_the_robot_s_limits(world, state, action
     assert (speed_rad_s.max(axis=0) <= arm.speed_limit_rad_s).all()
     assert np.abs(result.motion.qpos[-1, joints] - c.OBSERVATION_QPOS_RAD).max() < 2e-3
     if intended[:3] == state[:3]:  # it reaches out in vain, to 165 mm above what it cannot do
-        above_m = np.array([*(PALM_M if action == HAND_OVER else standing_m(action))]) + (0.0, 0.0, 0.165)
+        above_m = np.add(PALM_M if action == HAND_OVER else standing_m(action), (0.0, 0.0, 0.165))
         away_m = [np.linalg.norm(arm.tcp_in_base(qpos)[0] - above_m) for qpos in result.motion.qpos[:, joints]]
         assert min(away_m) < 5e-3
     untouched = [index for index in range(3) if state[index] == intended[index] == 0]
