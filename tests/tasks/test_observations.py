@@ -35,16 +35,16 @@ def decoded(one_hot, task):
 @pytest.mark.parametrize(("task", "execution"), list(zip(WORLDS, EXECUTIONS, strict=True)))
 def test_all_parts_are_of_one_moment_of_the_same_walk(task, execution):
     """The fragments, light and noise of a photograph are of the agent's camera alone: people see none."""
-    options = {"execution": execution, "appearance": "photo" if execution == "kinematic" else "mild"}
+    options = {"execution": execution, "appearance": "photo" if execution == "kinematic" else "mild", "size": 48}
     plain, whole = make(task, **options), make(task, observation=ALL, **options)
-    assert plain.observation_space == gymnasium.spaces.Box(0, 255, (64, 64, 3), np.uint8)
+    assert plain.observation_space == gymnasium.spaces.Box(0, 255, (48, 48, 3), np.uint8)
     scene, told = whole.unwrapped, set()
     for go in (lambda env: env.reset(seed=2), lambda env: env.step(1), lambda env: env.step(0)):
         (frame, *_, info), (parts, *_, info_too) = go(plain), go(whole)
         motion = scene.arm_motion()
         sense = [*motion.joint_rad[-1], *motion.gripper_m[-1], *motion.tcp_in_world[-1]]
         np.testing.assert_array_equal(parts["proprio"], np.array(sense, dtype=np.float32))
-        np.testing.assert_array_equal(parts["human"], scene.human_view(64, 64))
+        np.testing.assert_array_equal(parts["human"], scene.human_view(48, 48))
         np.testing.assert_array_equal(parts["frame"], frame)
         np.testing.assert_equal(info, info_too)
         assert parts in whole.observation_space

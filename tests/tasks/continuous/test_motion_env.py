@@ -9,7 +9,7 @@ from unittest import mock
 import numpy as np
 import pytest
 from by_hand import FAMILIES, FREE, STARTS, carry_out, environment
-from imagine_bench.tasks.continuous.controls import CONTROL_NAMES
+from imagine_bench.tasks.continuous.controls import CONTROL_NAMES, WORKSPACE_HIGH_M, WORKSPACE_LOW_M
 from imagine_bench.tasks.continuous.env import MotionEnv
 from imagine_bench.tasks.continuous.expert import Expert
 from imagine_bench.tasks.continuous.instructions import instruction
@@ -46,7 +46,7 @@ def test_commands_keep_the_limits_of_speed_and_range(control: str, rate_hz: floa
     rng = np.random.default_rng(0)
     low, high = env.action_space.low, env.action_space.high
     most_rad = np.array(JOINT_SPEED_LIMITS_RAD_S) / rate_hz
-    over, periods, gentle = True, 0, 0
+    over, periods, gentle, outside = True, 0, 0, False
     for _ in range(40):
         if over:
             env.reset(seed=0)
@@ -64,6 +64,8 @@ def test_commands_keep_the_limits_of_speed_and_range(control: str, rate_hz: floa
             asked_rad = before[:7] + held[:7] * most_rad if control == "joint_delta" else held[:7]
             within_rad = asked_rad.clip(before[:7] - most_rad, before[:7] + most_rad)
             assert joints_rad == pytest.approx(within_rad.clip(*env.model.jnt_range[:7].T), abs=1e-9)
+        hand_m = env.hand_target_m()
+        outside |= np.abs(hand_m - hand_m.clip(WORKSPACE_LOW_M, WORKSPACE_HIGH_M)).max() > 0.005
         if control == "twist" and np.abs(held).max() < 0.2 and not info["limited"]:
             (from_m, turn), (to_m, turned) = (env.controls.hand_pose(each) for each in (before[:7], joints_rad))
             about = turned @ turn.T
@@ -77,6 +79,7 @@ def test_commands_keep_the_limits_of_speed_and_range(control: str, rate_hz: floa
         assert (info["sim_time_s"], info["elapsed_s"]) == pytest.approx((1.0 / rate_hz, env.data.time))
         assert env.data.time == pytest.approx(periods / rate_hz)
     assert gentle > 3 or control != "twist"
+    assert outside or not control.startswith("joint"), "joints are not held in the workspace"
 
 
 @pytest.mark.parametrize("family", FAMILIES)

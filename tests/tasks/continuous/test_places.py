@@ -94,6 +94,7 @@ def test_readings_of_an_object_refer_to_its_place(family: str, values: range) ->
 
 
 def test_progress_of_an_object_is_a_share_of_5_cm_up_or_of_30_cm_away() -> None:
+    """Gripped and lifted by so much, it is picked."""
     world = make_pick_place(observation="proprio").world
     for index, from_m, off_m, (before, after), share in (
         (2, standing_m(2), (0.0, 0.0, 0.02), (0, 1), 0.4),
@@ -102,6 +103,9 @@ def test_progress_of_an_object_is_a_share_of_5_cm_up_or_of_30_cm_away() -> None:
     ):
         pose = [*np.add(from_m, off_m).tolist(), 1.0, 0.0, 0.0, 0.0]
         assert world.progress(index, pose, before, after) == pytest.approx(share)
+    for lifted_m, gripped, value in ((0.049, True, 0), (0.051, True, 1), (0.2, False, 0)):
+        pose = [*np.add(standing_m(1), (0.1, 0.1, lifted_m)).tolist(), 1.0, 0.0, 0.0, 0.0]
+        assert world.value_in_hand(1, pose, 0, gripped=gripped) == value
 
 
 def test_a_turned_cube_belongs_to_the_place_of_its_start() -> None:
