@@ -175,37 +175,3 @@ def test_copies_and_states_in_the_middle_of_a_grasp_go_on_to_the_bit(family: str
             for name, array in (*seen.items(), *info.items()):
                 np.testing.assert_array_equal({**also, **info_also}[name], array)
     assert env.episode.events == 1 - slips
-
-
-def single(name: str, **options: Any) -> Any:
-    return gymnasium.make(f"imagine_bench/{name}Motion-v0", disable_env_checker=True, **options).unwrapped
-
-
-@pytest.mark.parametrize("name", ["ArrowPuzzle", "PickPlace"])
-def test_lanes_are_single_environments_to_the_bit(name: str) -> None:
-    """Beyond the ends of episodes, and from a lane's state in the middle of one."""
-    of: dict[str, Any] = {"observation": "hand,proprio", "size": 32, "appearance": "strong"}
-    options = {**of, "time_limit_s": 0.6, "slip": 0.5}
-    lanes = gymnasium.make_vec(f"imagine_bench/{name}Motion-vector-v0", 2, **options)
-    singles = [single(name, **options) for _ in range(2)]
-    lanes.reset(seed=3)
-    for lane, env in enumerate(singles):
-        env.reset(seed=3 + lane)
-    rng = np.random.default_rng(0)
-    ends = 0
-    for step in range(40):
-        actions = rng.uniform(-1, 1, lanes.action_space.shape).astype(np.float32)
-        seen, *results, _ = lanes.step(actions)
-        for lane, env in enumerate(singles):
-            one, *same, _ = env.step(actions[lane])
-            assert same == [each[lane] for each in results]
-            if same[1] or same[2]:
-                ends += 1
-                one, _ = env.reset()
-            for part, array in one.items():
-                np.testing.assert_array_equal(seen[part][lane], array)
-        if step == 20:
-            singles = [single(name, **options) for _ in range(2)]
-            for env, lane_env in zip(singles, lanes.unwrapped.envs, strict=True):
-                env.set_state(lane_env.get_state())
-    assert ends >= 4
