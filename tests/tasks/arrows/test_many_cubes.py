@@ -66,30 +66,19 @@ def test_fingers_open_where_there_is_more_room_and_as_far():
         world.place((0, 0, 0, 0), np.random.default_rng(0))
         stands_m, *rows = (world.data.qpos[row[0] : row[-1] + 1] for row in world.object_qpos)
         for number, row in enumerate(rows):
-            x_mm, y_mm, yaw_deg = others[number] if number < len(others) else (-300, 300 * number, 0)
+            x_mm, y_mm, yaw_deg = others[number] if number < len(others) else (200, -100 * number, 0)
             row[:2] = stands_m[:2] + 1e-3 * np.array([x_mm, y_mm])
             row[3:] = about_vertical(math.radians(yaw_deg))
         off = (1e-3 * noise[0], 1e-3 * noise[1], math.radians(noise[2]))
-        world.executor.turn(cube=0, clockwise=clockwise, noise=off)
+        before_m = world.object_poses()[1:, :3]
+        assert world.executor.turn(cube=0, clockwise=clockwise, noise=off).fault is None
+        shift_m = np.abs(world.object_poses()[1:, :3] - before_m).max()
+        assert shift_m < 1e-4 or not any(noise), "it comes down where it shall and touches no other"
         trajectory = world.executor.trajectory
         step = trajectory.last_step["open" if any(noise) else "reach"]
         opens_along = arm.tcp_in_base(trajectory.qpos_rad[step])[1][:2, 1]
         found = "xy"[np.abs(opens_along).argmax()], 1e3 * trajectory.opening_m[step]
         assert found == (axis, pytest.approx(opening_mm, abs=0.01)), (others, clockwise, noise)
-
-
-@pytest.mark.parametrize("turned_deg", [-20, 0, 20])
-@pytest.mark.parametrize("clockwise", [True, False])
-def test_fingers_open_as_far_as_there_is_room(clockwise, turned_deg):
-    """The next cube of its row stands 9 mm nearer, and the cube is put down 9 mm nearer to that, turned either way."""
-    world = _world(cubes=6, forbid="none")
-    world.place((0,) * 6 + (0,), np.random.default_rng(0))
-    assert world.layout.slots_xy_m[1][0] == world.layout.slots_xy_m[3][0], "they stand side by side"
-    world.data.qpos[world.object_qpos[3][1]] += 0.009
-    before = world.object_poses()
-    assert world.executor.turn(cube=1, clockwise=clockwise, noise=(0.0, -0.009, math.radians(turned_deg))).fault is None
-    shift_m = np.linalg.norm(world.object_poses()[:, :3] - before[:, :3], axis=1)
-    assert np.delete(shift_m, 1).max() < 1e-4 and shift_m[1] > 0.008
 
 
 @pytest.mark.parametrize("action", [0, 1, 2, 3])
