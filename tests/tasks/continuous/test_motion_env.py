@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Any
 from unittest import mock
@@ -98,12 +99,19 @@ def test_commands_keep_the_limits_of_speed_and_range(control: str, rate_hz: floa
     ],
 )
 def test_parameters_of_a_world_mean_what_they_mean_of_macro_actions(family: str, option: dict[str, Any]) -> None:
+    """What varies looks the same until an event, and otherwise after it."""
     env = FAMILIES[family](observation="state,objects", **option, **FREE[family])
     start = STARTS[family]
     first, info = env.reset(seed=0, options={"macrostate": start})
     assert bool(info["instruction"]) == bool(option.get("told"))
     expert = Expert(env)
+    looks = [env.model.mat_rgba[:, :3].copy()]
+    env.step(np.zeros(7))
+    looks.append(env.model.mat_rgba[:, :3].copy())
     event = next(each for _ in range(9) for each in carry_out(env, expert, 0))
+    looks.append(env.model.mat_rgba[:, :3].copy())
+    varies = bool(option.keys() & {"appearance", "distractors"})
+    assert [np.array_equal(*pair) for pair in itertools.pairwise(looks)] == [True, not varies]
     after = tuple(event["macrostate"])
     assert not event["fault"]
     assert env.world.read().macrostate == after
