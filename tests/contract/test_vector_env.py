@@ -39,12 +39,13 @@ def make_sync(mode, **options):
     return gymnasium.make_vec("imagine_bench/ArrowPuzzle-v0", **options)
 
 
-def walk_both(envs, steps, n_actions, *, mask):
+def walk_both(envs, steps, *, mask):
     """Step two vector environments alike and compare their results: how many episodes ended by rule and limit."""
     assert_same(*(env.reset(seed=3) for env in envs))
-    rng, ended = np.random.default_rng(0), np.zeros(2, dtype=int)
+    envs[0].action_space.seed(2)
+    ended = np.zeros(2, dtype=int)
     for step in range(steps):
-        actions = rng.integers(n_actions, size=envs[0].num_envs)
+        actions = envs[0].action_space.sample()
         its, own = (env.step(actions) for env in envs)
         assert_same(its, own, f"step {step}")
         over = its[2] | its[3]
@@ -57,6 +58,13 @@ def walk_both(envs, steps, n_actions, *, mask):
 
 SAME_STEP = AutoresetMode.SAME_STEP
 SHORT = {"max_episode_steps": 2}
+COMMANDS = {
+    "observation": "hand,proprio,objects,state",
+    "size": 32,
+    "time_limit_s": 0.6,
+    "slip": 0.5,
+    "max_episode_steps": None,
+}
 
 
 @pytest.mark.parametrize(
@@ -68,6 +76,7 @@ SHORT = {"max_episode_steps": 2}
         ("Arrows", "physics", SAME_STEP, 3, {"cubes": 5, "coupling": "neighbour", "slip": 0.3, "distractors": 3}),
         ("PickPlace", "physics", SAME_STEP, 4, {"gesture": 0.5, "lag": 1, "slip": 0.5}),
         ("PickPlace", "kinematic", AutoresetMode.NEXT_STEP, 8, {"observation": "frame,state,proprio", "size": 32}),
+        *((f"{name}Motion", "physics", SAME_STEP, 32, COMMANDS) for name in ("ArrowPuzzle", "PickPlace")),
         *(("ArrowPuzzle", "kinematic", mode, 16, SHORT) for mode in MODES),
         ("PickPlace", "kinematic", MODES[0], 16, SHORT),
         *(pytest.param("PickPlace", "kinematic", mode, 16, SHORT, marks=pytest.mark.slow) for mode in MODES[1:]),
@@ -75,17 +84,18 @@ SHORT = {"max_episode_steps": 2}
 )
 def test_lanes_of_any_world_step_as_sync_in_every_mode(name, execution, mode, steps, world):
     """Through ends by rule and by the limit, with any observation."""
-    options = {"execution": execution, "appearance": "strong", "max_episode_steps": 3, **world}
+    options = {"appearance": "strong", "max_episode_steps": 3, **world}
+    options |= {} if name.endswith("Motion") else {"execution": execution}
     make_vec = functools.partial(gymnasium.make_vec, num_envs=2, **options)
     sync = make_vec(f"imagine_bench/{name}-v0", vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode})
     vector = make_vec(f"imagine_bench/{name}-vector-v0", threads=3, autoreset_mode=mode)
-    n_actions = int(sync.single_action_space.n)
-    ended = walk_both((sync, vector), steps, n_actions, mask=mode == AutoresetMode.DISABLED)
+    ended = walk_both((sync, vector), steps, mask=mode == AutoresetMode.DISABLED)
     assert (ended > 0).all() if world == SHORT else ended.sum() > 0
     assert vector.action_names == sync.envs[0].unwrapped.action_names
     for field in ("qpos", "qvel", "mocap_pos"):
         assert_same(*([getattr(lane.unwrapped.data, field) for lane in env.envs] for env in (sync, vector)))
-    assert mode == AutoresetMode.DISABLED or vector.observation_space.contains(vector.step(np.zeros(2, dtype=int))[0])
+    last = vector.action_space.sample()
+    assert mode == AutoresetMode.DISABLED or vector.observation_space.contains(vector.step(last)[0])
     sync.close()
     vector.close()
 
@@ -132,14 +142,16 @@ def test_each_lane_goes_its_own_pace_and_sees_what_it_would_alone():
     rules, rng = registry.task("arrow_puzzle").rules, np.random.default_rng(5)
     plans = [quiet_plan(rules, START, 3, rng) for _ in range(N_LANES)]
     vector = make(autoreset_mode="Disabled")
-    seen = [[frame] for frame in vector.reset(seed=7, options={"macrostate": START})[0]]
+    seen, reached = [[frame] for frame in vector.reset(seed=7, options={"macrostate": START})[0]], [START] * N_LANES
     vector.send([plan[0] for plan in plans])
     for n in (2, 2, 1, 2, 1, 1):
         frames, *_, infos = vector.recv(n)
         lanes = infos["env_id"].tolist()
-        assert infos["macrostate"].shape == (n, 4) and infos["_macrostate"].all()
         for lane, frame in zip(lanes, frames, strict=True):
+            (outcome,) = rules.outcomes(reached[lane], plans[lane][len(seen[lane]) - 1])
+            reached[lane] = outcome.macrostate
             seen[lane].append(frame)
+        assert infos["macrostate"].tolist() == [list(reached[lane]) for lane in lanes] and infos["_macrostate"].all()
         going = [lane for lane in lanes if len(seen[lane]) <= 3]
         if going:
             vector.send([plans[lane][len(seen[lane]) - 1] for lane in going], going)

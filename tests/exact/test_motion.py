@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from pathlib import Path
 from typing import Any
@@ -9,13 +10,14 @@ from unittest import mock
 
 import pytest
 from imagine_bench.tasks.arrows.rules import Arrows
+from imagine_bench.tasks.continuous.segments import least_seconds
 
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.exact import motion
 from imagine_bench.exact.motion import certificate, measured
-from imagine_bench.interfaces import TaskSpec
+from imagine_bench.interfaces import State, TaskSpec
 from imagine_bench.rules import shortest_plans, states_of_play, tabulate
 from imagine_bench.statistics import wilson
 from imagine_bench.tools.describe import describe
@@ -95,6 +97,28 @@ def test_what_was_measured_leaves_less_than_a_point(task: str, appearance: str) 
     assert found.random_solved <= 0.01 * found.random_episodes
     assert 0.1 < found.least_s < found.mean_s
     assert found.macro_actions >= int(shortest_plans(tabulate(spec.rules)).max())
+
+
+@pytest.mark.parametrize("task", MEASURED)
+def test_what_was_measured_is_of_the_task_as_it_is(task: str) -> None:
+    """Each pair once, with its least time as computed now; a pair ends episodes if none of its macrostates goes on."""
+    rules, entry = registry.task(task).rules, registry.task_entry(task)
+    wanted: dict[tuple[State, int], tuple[bool, State]] = {}
+    for state, action in itertools.product(states_of_play(rules), range(rules.n_actions)):
+        first, *_ = outcomes = rules.outcomes(state, action)
+        if any(each.macrostate[:-1] != state[:-1] for each in outcomes):
+            pair = (state[:-1], action)
+            wanted[pair] = min(wanted.get(pair, (True, state)), (first.terminated, state))
+    for appearance, kept in measured(task)["appearances"].items():
+        env = registry.load(entry.motion)(**entry.options, appearance=appearance, observation="proprio")
+        found = {(tuple(objects), action): ends for objects, action, *_, ends in kept["segments"]}
+        assert found == {pair: ends for pair, (ends, _) in wanted.items()}
+        assert kept["pairs"] == len(kept["segments"]) == len(found)
+        assert kept["time_limit_s"] == env.time_limit_s
+        least_s = [least_seconds(env, wanted[pair][1], pair[1]) for pair in found]
+        assert kept["least_s"] == pytest.approx(least_s)
+        for (*_, tries, right, mean_s, longest_s, _), least in zip(kept["segments"], least_s, strict=True):
+            assert right <= tries and least <= mean_s <= longest_s
 
 
 @pytest.mark.parametrize("name", ["ArrowPuzzleEasyMotion", "PickPlaceMotion"])

@@ -48,8 +48,12 @@ def test_velocities_and_poses_belong_to_the_angles():
     assert np.abs(motion.joint_command_rad - motion.joint_rad).max() > 0.01, "told ahead of the motion"
 
 
-def test_rates_above_the_simulation_s_are_interpolated():
+def test_rates_below_the_simulation_s_take_its_nearest_steps_and_rates_above_are_interpolated():
     _, steps, _ = turned(1 / TIMESTEP_S)
+    _, motion, _ = turned(30)  # 4.17 steps apart
+    taken = [*np.round(np.arange(0, len(steps.time_s) - 1, 125 / 30)).astype(int), -1]
+    for name in ("time_s", "joint_rad", "joint_rad_s", "gripper_m", "joint_command_rad", "tcp_in_world"):
+        np.testing.assert_allclose(getattr(motion, name), getattr(steps, name)[taken], atol=1e-12, err_msg=name)
     env, motion, info = turned(200)
     assert len(motion.time_s) == 1 + math.ceil(200 * info["sim_time_s"] - 1e-6)
     np.testing.assert_allclose(np.diff(motion.time_s)[:-1], 0.005)

@@ -64,6 +64,20 @@ def test_what_decides_whether_a_grasp_holds(task, setting, value, low, high):
     assert low <= as_ruled(registry.task(task), PhysicsSettings.of({setting: value}), 12) <= high
 
 
+def test_yaw_and_tilt_are_those_of_the_axes():
+    """Of any pose, also where its quaternion is not of unit length; and an error moves and turns it, no more."""
+    sensing, rng = Sensing(aside_m=(0.003, -0.002), turned_rad=0.1), np.random.default_rng(0)
+    for _ in range(50):
+        qpos, axes = rng.standard_normal(7), np.empty(9)
+        mujoco.mju_quat2Mat(axes, qpos[3:] / np.linalg.norm(qpos[3:]))
+        pose = sensing.pose(qpos, np.zeros(3))
+        x, z = axes.reshape(3, 3).T[[0, 2]]
+        assert (pose.yaw_rad, pose.tilt_rad) == pytest.approx((np.arctan2(x[1], x[0]), np.arccos(z[2])), abs=1e-7)
+        erring = sensing.erring(pose)
+        assert (erring.yaw_rad, erring.tilt_rad) == (pose.yaw_rad + 0.1, pose.tilt_rad)
+        np.testing.assert_allclose(erring.position_m - qpos[:3], (0.003, -0.002, 0.0), atol=1e-12)
+
+
 def test_errors_of_the_planner_point_everywhere():
     """As far as said, in each quadrant equally often, and to both sides about the vertical."""
     sensing, rng = Sensing(settings=PhysicsSettings(plan_error_mm=5.0, plan_error_deg=2.0)), np.random.default_rng(0)

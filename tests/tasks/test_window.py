@@ -26,9 +26,9 @@ def make(**options):
 
 @pytest.fixture
 def shown(monkeypatch):
-    """The images of windows, one by one, without waiting between them."""
+    """The images of windows, one by one, and how many are due a second, without waiting between them."""
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    images, flip = [], pygame.display.flip
+    images, rates, flip = [], [], pygame.display.flip
 
     def keep():
         images.append(pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1))
@@ -36,15 +36,16 @@ def shown(monkeypatch):
 
     class Clock:
         def tick(self, per_s):
-            assert per_s > 0
+            rates.append(per_s)
 
     monkeypatch.setattr(pygame.display, "flip", keep)
     monkeypatch.setattr(pygame.time, "Clock", Clock)
-    yield images
+    yield images, rates
     pygame.quit()
 
 
 def test_a_window_shows_the_motion_and_changes_no_bit(shown):
+    shown, rates = shown
     assert make(render_mode="human").unwrapped.capture_motion_hz == 25
     small = {"width": 64, "height": 48}
     env, plain = make(render_mode="human", motion_hz=5, **small), make(render_mode="rgb_array", **small)
@@ -57,6 +58,7 @@ def test_a_window_shows_the_motion_and_changes_no_bit(shown):
     np.testing.assert_equal(step, step_too)
     np.testing.assert_array_equal(shown[-1], plain.render())
     motion = shown[before:]
+    assert rates == [5, 25, *[5] * (len(motion) - 1), 25], "how the scene stands is shown for a moment"
     assert len(motion) == pytest.approx(5 * step[4]["sim_time_s"], abs=3)
     assert len({image.tobytes() for image in motion}) > 0.8 * len(motion)
     np.testing.assert_array_equal(motion[0], shown[before - 1])
@@ -65,6 +67,17 @@ def test_a_window_shows_the_motion_and_changes_no_bit(shown):
     for each in (env, plain, twin):
         each.close()
     assert not pygame.display.get_init()
+
+
+def test_a_window_of_continuous_control_shows_an_image_a_command(shown):
+    images, rates = shown
+    options = {"render_mode": "human", "rate_hz": 12.5, "observation": "proprio", "width": 64, "height": 48}
+    env = gymnasium.make("imagine_bench/ArrowPuzzleEasyMotion-v0", disable_env_checker=True, **options)
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(np.zeros(7))
+    env.close()
+    assert len(images) == 4 and rates == pytest.approx([12.5] * 4)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is a desktop")

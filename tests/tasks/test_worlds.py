@@ -6,8 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.world import ArrowWorld
-from imagine_bench.tasks.pick_place.rules import HANDED_OVER, OPEN_PALM
-from imagine_bench.tasks.pick_place.scene import PALM_M
+from imagine_bench.tasks.pick_place.rules import HANDED_OVER, OPEN_PALM, PICKED, PLACED
 from imagine_bench.tasks.pick_place.world import PickWorld
 from imagine_bench.tasks.scenes.appearance import LEVELS, Appearance
 from imagine_bench.tasks.scenes.constants import ARM_GROUP
@@ -68,17 +67,21 @@ def test_what_is_read_of_displaced_objects(expected):
     expected("displaced_objects", tabulated(rows))
 
 
+IN_PALM = ((0, 0.036), (1, 0.036), (2, 0.006))
+
+
 @pytest.mark.parametrize("index", range(len(OBJECTS)))
-def test_an_object_is_in_the_palm_at_its_height_alone(index):
+def test_an_object_is_held_or_handed_over_near_the_middle_alone(index):
+    """15 mm off the gripper's; 36 mm off the palm's, and 6 mm off its height there."""
     world = world_of("pick_place", FIXED)
-    world.place((0, 0, 0, OPEN_PALM), np.random.default_rng(0))
     row = world.object_qpos[index]
-    found = []
-    for above_m in (-0.03, 0.0, 0.03):
-        lies_m = (0.0, 0.0, OBJECTS[index].grip_height_m + above_m)
-        world.data.qpos[row[:3]] = np.add(PALM_M, lies_m)
-        found.append(world.read().macrostate[index])
-    assert found == [0, HANDED_OVER, 0]
+    for value, axis, most_m in ((PICKED, 0, 0.015), (PICKED, 2, 0.015), *((HANDED_OVER, *each) for each in IN_PALM)):
+        for off_m in (-most_m - 0.001, -most_m + 0.001, most_m - 0.001, most_m + 0.001):
+            world.place((*(value * (each == index) for each in range(3)), OPEN_PALM), np.random.default_rng(0))
+            world.data.qpos[row[axis]] += off_m
+            reading = world.read()
+            assert reading.macrostate[index] == (value if abs(off_m) < most_m else PLACED), (value, axis, off_m)
+            assert (reading.problem is None) == (abs(off_m) < most_m)
 
 
 @pytest.mark.parametrize("name", NAMES)

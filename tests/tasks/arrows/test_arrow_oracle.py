@@ -13,6 +13,7 @@ WORLDS = [
     "arrow_puzzle",
     "arrow_puzzle_hard",
     "arrow_puzzle_clockwise",
+    "arrow_puzzle_toward",
     "arrow_puzzle_easy",
     "arrows:cubes=2,fickle=0.5",
     "arrows:slip=0.2",

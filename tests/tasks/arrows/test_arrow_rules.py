@@ -38,6 +38,7 @@ def test_counts_of_macrostates():
 )
 def test_facts_of_the_digest(rules, chance, optimal_return, mean_length):
     known = facts(rules, 10)
+    assert not is_random(rules)
     assert known.chance_level == pytest.approx(chance, abs=5e-6)
     assert known.optimum == pytest.approx(1.0, abs=1e-12)
     assert known.optimal_return == pytest.approx(optimal_return, abs=5e-4)

@@ -18,6 +18,7 @@ from imagine_bench.tasks.continuous.env import MotionEnv
 from imagine_bench.tasks.continuous.expert import Expert
 from imagine_bench.tasks.continuous.spec import make_arrows
 from imagine_bench.tasks.scene_env import SceneEnv
+from same_values import assert_same
 from storms import hostile, one_sentence
 
 from imagine_bench.errors import ImagineBenchError, InvalidValueError
@@ -102,40 +103,58 @@ def test_a_damaged_state_is_refused_and_changes_nothing(name: str) -> None:
         assert pickle.dumps(env.get_state()) == before
 
 
-def test_a_state_goes_on_with_the_rewards_that_it_began_with() -> None:
-    """The state of a dense reward holds a potential, from which its next reward is counted."""
-    env, alike = (make_arrows(observation="proprio", reward="dense") for _ in range(2))
-    for each, seed in ((env, 1), (alike, 2)):
-        each.reset(seed=seed)
-    down = np.array([0, 0, -0.2, 0, 0, 0, 1], dtype=np.float32)
-    env.step(down)
-    alike.set_state(env.get_state())
-    assert alike.step(down)[1] == env.step(down)[1]
+@pytest.mark.parametrize(
+    "option",
+    [
+        {"control": "joint"},
+        {"rate_hz": 12.5},
+        {"appearance": "mild"},
+        {"reward": "dense"},
+        {"physics": {"object_mass": 2.0}},
+        {"slip": 0.1},
+        {"told": True},
+        {"placement": 0.01},
+        {"distractors": 1},
+        {"cubes": 2},
+    ],
+    ids=str,
+)
+def test_a_state_of_an_environment_that_goes_on_otherwise_is_refused(option: dict[str, Any]) -> None:
+    envs = [make_arrows(observation="proprio", **given) for given in ({}, option)]
+    for env in envs:
+        env.reset(seed=0)
+    for env, other in (envs, envs[::-1]):
+        with pytest.raises(InvalidValueError, match="give one of get_state"):
+            env.set_state(other.get_state())
 
 
-ANOTHER = {
-    "slip": 0.5, "told": True, "placement": 0.02, "reward": "dense", "control": "joint_delta", "rate_hz": 62.5,
-    "appearance": "mild", "physics": {"object_mass": 2.0}, "distractors": 1,
-}  # fmt: skip
-
-
-def test_a_state_of_another_world_command_or_reward_is_refused() -> None:
-    env = make_arrows(cubes=1, observation="proprio")
-    env.reset(seed=0)
-    for option, value in ANOTHER.items():
-        other = make_arrows(cubes=1, observation="proprio", **{option: value})
-        other.reset(seed=0)
-        for one, state in ((env, other.get_state()), (other, env.get_state())):
-            with pytest.raises(InvalidValueError, match="give one of get_state"):
-                one.set_state(state)
+@pytest.mark.parametrize("family", FAMILIES)
+def test_an_episode_knows_nothing_of_the_one_before(family: str) -> None:
+    """Which was left in the middle of a grip that slipped, after a motion of its own."""
+    options = {"observation": "hand,proprio,objects,state", "size": 32, "slip": 0.99, "gesture": "first", "lag": 1}
+    options |= {"placement": 0.03, "appearance": "strong", "reward": "dense"}
+    left, fresh = (FAMILIES[family](**options) for _ in range(2))
+    left.reset(seed=6, options={"macrostate": STARTS[family]})
+    expert = Expert(left)
+    expert.begin(0)
+    while not left.episode.slipping:
+        left.step(expert.act())
+    closing = np.array([[0.1, 0, 0, 0, 0, 0.2, -1]] * 10, dtype=np.float32)
+    for env in (left, fresh):
+        env.reset(seed=4)
+    for action in closing:
+        assert_same(*(env.step(action) for env in (left, fresh)))
+    assert pickle.dumps(left.get_state()) == pickle.dumps(fresh.get_state())
 
 
 @pytest.mark.parametrize("control", CONTROL_NAMES)
 @pytest.mark.parametrize("family", FAMILIES)
 def test_copies_and_states_in_the_middle_of_a_grasp_go_on_to_the_bit(family: str, control: str) -> None:
-    """Up to the grasp's event and beyond it; by joints the grip slips instead."""
+    """Up to the grasp's event and beyond it; by joints the grip slips instead. The next reward is counted from the
+    potential of the latest moment.
+    """
     slips = control == "joint"
-    options = {"observation": "hand,proprio,objects", "size": 32, "slip": 0.99 * slips}
+    options = {"observation": "hand,proprio,objects", "size": 32, "slip": 0.99 * slips, "reward": "dense"}
     make = functools.partial(FAMILIES[family], control=control, **options)
     env = make()
     env.reset(seed=6, options={"macrostate": STARTS[family]})
@@ -157,37 +176,3 @@ def test_copies_and_states_in_the_middle_of_a_grasp_go_on_to_the_bit(family: str
             for name, array in (*seen.items(), *info.items()):
                 np.testing.assert_array_equal({**also, **info_also}[name], array)
     assert env.episode.events == 1 - slips
-
-
-def single(name: str, **options: Any) -> Any:
-    return gymnasium.make(f"imagine_bench/{name}Motion-v0", disable_env_checker=True, **options).unwrapped
-
-
-@pytest.mark.parametrize("name", ["ArrowPuzzle", "PickPlace"])
-def test_lanes_are_single_environments_to_the_bit(name: str) -> None:
-    """Beyond the ends of episodes, and from a lane's state in the middle of one."""
-    of: dict[str, Any] = {"observation": "hand,proprio,objects,state", "size": 32, "appearance": "strong"}
-    options = {**of, "time_limit_s": 0.6, "slip": 0.5}
-    lanes = gymnasium.make_vec(f"imagine_bench/{name}Motion-vector-v0", 2, **options)
-    singles = [single(name, **options) for _ in range(2)]
-    lanes.reset(seed=3)
-    for lane, env in enumerate(singles):
-        env.reset(seed=3 + lane)
-    rng = np.random.default_rng(0)
-    ends = 0
-    for step in range(40):
-        actions = rng.uniform(-1, 1, lanes.action_space.shape).astype(np.float32)
-        seen, *results, _ = lanes.step(actions)
-        for lane, env in enumerate(singles):
-            one, *same, _ = env.step(actions[lane])
-            assert same == [each[lane] for each in results]
-            if same[1] or same[2]:
-                ends += 1
-                one, _ = env.reset()
-            for part, array in one.items():
-                np.testing.assert_array_equal(seen[part][lane], array)
-        if step == 20:
-            singles = [single(name, **options) for _ in range(2)]
-            for env, lane_env in zip(singles, lanes.unwrapped.envs, strict=True):
-                env.set_state(lane_env.get_state())
-    assert ends >= 4

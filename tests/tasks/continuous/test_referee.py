@@ -215,10 +215,12 @@ def test_a_trick_with_objects_is_seen(name: str) -> None:
 
 
 MOVES = ("qvel", 0, 0.02)
+MOVES_BACK = ("qvel", 1, -0.02)
+TURNS = ("qvel", 5, -0.3)
 STANDS_OFF = ("qpos", 0, 0.03)
 FALLS = ("qpos", 2, -0.2)
 FLOATS = ("qpos", 2, 0.02)
-"""A change of the second cube: of its position (m) or speed (m/s), along an axis, by so much."""
+"""A change of the second cube: of its position (m) or speed (m/s, rad/s), along or about an axis, by so much."""
 
 
 class ToldReferee(Referee):
@@ -237,7 +239,9 @@ class ToldReferee(Referee):
         ((0, 2, 3, 0), (0, 1, 0), None, None),
         ((3, 2, 3, 0), (0, 0, 0), None, "cube 0 went from left to right in one motion"),
         ((0, 2, 0, 0), (0, 0, 0), None, "cube 0 and cube 2 moved at once"),
-        ((0, 2, 3, 0), (0, 0, 0), MOVES, "cube 0 and cube 1 moved at once"),
+        *(((0, 2, 3, 0), (0, 0, 0), each, "cube 0 and cube 1 moved at once") for each in (MOVES, MOVES_BACK, TURNS)),
+        ((0, 2, 3, 0), (0, 0, 0), ("qvel", 2, 0.008), None),
+        ((0, 2, 3, 0), (0, 0, 0), ("qvel", 3, 0.15), None),
         ((0, 2, 3, 0), (0, 1, 0), STANDS_OFF, "cube 0 and cube 1 moved at once"),
         ((1, 2, 3, 0), (0, 0, 0), STANDS_OFF, "cube 1 stands 28 mm off its slot"),
         ((1, 2, 3, 0), (0, 1, 0), FALLS, "cube 1 fell off the table"),

@@ -1,14 +1,23 @@
 """Planning: inverse kinematics against forward kinematics, and trajectories against the robot's limits."""
 
 import math
+import re
 
 import mink
+import mujoco
 import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.rules import MAX_CUBES
-from imagine_bench.tasks.arrows.scene import layout
+from imagine_bench.tasks.arrows.scene import compile_arrow_scene, layout
 from imagine_bench.tasks.motion.arm_model import ArmModel
-from imagine_bench.tasks.motion.ik import ANGLE_TOLERANCE_RAD, POSITION_TOLERANCE_M, ArmIK, Reach, pointing_down
+from imagine_bench.tasks.motion.ik import (
+    ANGLE_TOLERANCE_RAD,
+    POSITION_TOLERANCE_M,
+    ArmIK,
+    Reach,
+    UnreachableTargetError,
+    pointing_down,
+)
 from imagine_bench.tasks.motion.trajectory import (
     EFFORT_SHARE,
     PEAK_ACCELERATION,
@@ -21,6 +30,7 @@ from imagine_bench.tasks.motion.trajectory import (
 )
 from imagine_bench.tasks.scenes.constants import CUBE_EDGE_M, HOME_QPOS_RAD, TABLE_HEIGHT_M, TIMESTEP_S
 
+PARTS = (("joint", ""), ("actuator", "_servo"))
 SLOTS_XY_M = sorted({slot for cubes in range(1, MAX_CUBES + 1) for slot in layout(cubes).slots_xy_m})
 CUBE_Z_M = TABLE_HEIGHT_M + CUBE_EDGE_M / 2
 
@@ -74,6 +84,17 @@ def test_ik_reaches_with_the_tool_straight_down(arm, ik, slot):
     assert found.error_m == pytest.approx(max(errors_m), abs=1e-9) and found.error_m < 5e-4
 
 
+def test_what_is_missing_to_a_place_out_of_reach_is_said(arm, ik):
+    place_m = np.array([1.3, 0.2, 0.1])
+    with pytest.raises(UnreachableTargetError) as caught:
+        ik.solve(place_m, 0.3, np.array(HOME_QPOS_RAD))
+    there_m, frame = arm.tcp_in_base(ik.configuration.q)
+    off_deg = math.degrees(np.linalg.norm((pointing_down(0.3).inverse() @ mink.SO3.from_matrix(frame)).log()))
+    said = r"reach \[1.3, 0.2, 0.1\] m at yaw 17 deg: after 40 steps (\S+) mm and (\S+) deg are missing"
+    missing = [float(each) for each in re.search(said, str(caught.value)).groups()]
+    assert missing == pytest.approx([1000 * np.linalg.norm(there_m - place_m), off_deg], rel=0.01)
+
+
 def test_steps_are_mink_s_to_the_bit(ik):
     """Near targets and far ones, at the joints' limits too."""
     rng, at_limits = np.random.default_rng(0), 0
@@ -125,17 +146,26 @@ def test_a_motion_is_as_short_as_speed_and_effort_allow(arm):
     assert len(held.opening_m) == 63, "unless it shall be longer"
 
 
-def test_what_is_told_there_and_back_differs_by_the_damping_alone(arm):
-    """For the inertia, of the whole motion that halfway, is told alike both ways."""
-    rng = np.random.default_rng(2)
+def test_a_command_is_ahead_by_the_lag_of_damping_and_inertia(arm):
+    """By (K_d q' + M q'') / K_p of the scene in which the arm acts, M that halfway, but for 0.1 mrad."""
+    rng, model = np.random.default_rng(2), compile_arrow_scene()
+    data, inertia = mujoco.MjData(model), np.empty((model.nv, model.nv))
+    joints, servos = ([getattr(model, kind)(f"right_j{index}{end}") for index in range(7)] for kind, end in PARTS)
+    columns = [int(joint.dofadr[0]) for joint in joints]
+    gains = np.array([servo.gainprm[0] for servo in servos])
+    damping = np.array([joint.damping[0] - servo.biasprm[2] for joint, servo in zip(joints, servos, strict=True)])
+    assert all(joint.damping[0] > 0.0 for joint in joints)
     for _ in range(5):
         start, end = rng.uniform(*arm.model.jnt_range.T, (2, 7))
-        there, back = (planned(arm, a, Waypoint("", b, 0.02)) for a, b in ((start, end), (end, start)))
-        steps = len(there.opening_m)
-        speed_rad_s = minimum_jerk(steps)[:-1, 1:2] * (end - start) / (steps * TIMESTEP_S)
-        damped_rad = arm.damping_nms_rad * speed_rad_s / arm.stiffness_nm_rad
-        apart_rad = there.arm_command_rad[:-1] - back.arm_command_rad[-2::-1]
-        np.testing.assert_allclose(apart_rad, 2 * damped_rad, atol=1e-9)
+        told = planned(arm, start, Waypoint("", end, 0.02))
+        data.qpos[[int(joint.qposadr[0]) for joint in joints]] = (start + end) / 2
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, inertia)
+        steps = len(told.opening_m)
+        _, speed, push = minimum_jerk(steps).T[..., None]
+        lag_nm = damping * speed * (end - start) / (steps * TIMESTEP_S)
+        lag_nm += push * (inertia[np.ix_(columns, columns)] @ (end - start)) / (steps * TIMESTEP_S) ** 2
+        np.testing.assert_allclose(told.arm_command_rad - told.qpos_rad, lag_nm / gains, atol=1e-4)
 
 
 def test_blended_motions_add_up(arm):

@@ -127,10 +127,14 @@ def test_lag_shows_the_frame_of_so_many_macro_actions_ago(id_):
         np.testing.assert_array_equal(macrostate, now[step][1])
 
 
-def test_who_writes_into_a_late_frame_changes_none_that_comes_after():
-    env, other = (make(IDS[0], lag=2) for _ in range(2))
+@pytest.mark.parametrize(
+    ("id_", "options", "actions"),
+    [("Arrows", KINEMATIC, (0, 1, 0, 1)), ("ArrowsMotion", {"observation": "front"}, np.zeros((2, 7)))],
+)
+def test_who_writes_into_a_late_frame_changes_none_that_comes_after(id_, options, actions):
+    env, other = (gymnasium.make(f"imagine_bench/{id_}-v0", lag=2, **options).unwrapped for _ in range(2))
     frames = [each.reset(seed=1)[0] for each in (env, other)]
-    for action in (0, 1, 0, 1):
+    for action in actions:
         frames[0][:] = 0
         frames = [each.step(action)[0] for each in (env, other)]
         np.testing.assert_array_equal(*frames)

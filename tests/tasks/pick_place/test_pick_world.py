@@ -8,6 +8,7 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
+from imagine_bench.tasks.motion import orientation
 from imagine_bench.tasks.motion.arm_model import ArmModel
 from imagine_bench.tasks.motion.orientation import yaw_rad
 from imagine_bench.tasks.pick_place.rules import HAND_OVER, OPEN_PALM, WITHDRAWN
@@ -75,9 +76,13 @@ def test_motions_follow_the_rules_within_the_robot_s_limits(world, state, action
     assert result.fault is None
     assert (world.read().macrostate, world.read().problem) == (intended, None)
     joints = [int(world.model.joint(f"right_j{index}").qposadr[0]) for index in range(7)]
-    speed_rad_s = np.abs(np.diff(result.motion.qpos[:, joints], axis=0)) / TIMESTEP_S
-    assert (speed_rad_s.max(axis=0) <= ArmModel().speed_limit_rad_s).all()
+    arm, speed_rad_s = ArmModel(), np.abs(np.diff(result.motion.qpos[:, joints], axis=0)) / TIMESTEP_S
+    assert (speed_rad_s.max(axis=0) <= arm.speed_limit_rad_s).all()
     assert np.abs(result.motion.qpos[-1, joints] - c.OBSERVATION_QPOS_RAD).max() < 2e-3
+    if intended[:3] == state[:3]:  # it reaches out in vain, to 165 mm above what it cannot do
+        above_m = np.add(PALM_M if action == HAND_OVER else standing_m(action), (0.0, 0.0, 0.165))
+        away_m = [np.linalg.norm(arm.tcp_in_base(qpos)[0] - above_m) for qpos in result.motion.qpos[:, joints]]
+        assert min(away_m) < 5e-3
     untouched = [index for index in range(3) if state[index] == intended[index] == 0]
     assert np.abs(world.object_poses()[untouched, :3] - before[untouched, :3]).max(initial=0.0) < 1e-4
 
@@ -111,13 +116,16 @@ def test_a_ball_is_picked_alike_however_it_has_rolled(world):
     np.testing.assert_array_equal(*commands)
 
 
-def test_an_object_held_off_the_grips_middle_comes_down_on_its_place(world):
-    """4 mm aside in the fingers, which turn it by 0.3 rad."""
-    world.place((0, 1, 0, 2), rng())
-    row = world.object_qpos[1]
-    world.data.qpos[row[0]] += 0.004
-    assert world.executor.place(index=1, noise=(0.0, 0.0, 0.3)).fault is None
-    assert np.linalg.norm(world.data.qpos[row[:2]] - standing_m(1)[:2]) < 1e-3
+@pytest.mark.parametrize(("index", "aside_m", "turned_deg"), [(1, 0.004, 0), (2, 0.0, 10)])
+def test_an_object_held_off_the_grips_middle_comes_down_on_its_place(world, index, aside_m, turned_deg):
+    """Flat sides are held aside, and round ones turned; it is put 3 mm and 2 mm off its place and turned by 0.3 rad."""
+    world.place((*(int(each == index) for each in range(3)), 0), rng())
+    turn(world, index, 2, turned_deg)
+    row = world.object_qpos[index]
+    world.data.qpos[row[0]] += aside_m
+    assert world.executor.place(index=index, noise=(0.003, -0.002, 0.3)).fault is None
+    assert np.linalg.norm(world.data.qpos[row[:2]] - standing_m(index)[:2] - (0.003, -0.002)) < 1e-3
+    assert orientation.yaw_rad(*world.data.qpos[row[3:]]) == pytest.approx(0.3, abs=0.02)
 
 
 def slippery_tips(model):

@@ -73,6 +73,12 @@ def spread(values):
     return float(np.ptp(np.array(values), axis=0).max() / 2)
 
 
+def places_of(poses):
+    """x, y and z in m and yaw in rad of poses in draws: (N, B, 7) to (N, B, 4)."""
+    poses = np.array(poses)
+    return np.concatenate([poses[..., :3], 2 * np.arctan2(poses[..., 6:], poses[..., 3:4])], axis=-1)
+
+
 def least_and_most(values):
     return f"{values.min():.3g} to {values.max():.3g}"
 
@@ -80,7 +86,7 @@ def least_and_most(values):
 def drawn(task, given, size):
     """All that 200 starts vary, and by how much; the frame is gray with a white spot at row and column 30."""
     env, usual = make(task, appearance=given, size=size), appearance_arrays(make(task).model)
-    world, rng, width_m = env.world, np.random.default_rng(0), appearance(given).object_offset_m
+    world, rng, level = env.world, np.random.default_rng(0), appearance(given)
     frame = np.full((size, size, 3), 128, np.uint8)
     frame[30, 30] = 255
     poses, hands, looks, frames, stays = [], [], [], [], 0
@@ -88,7 +94,7 @@ def drawn(task, given, size):
         world.place(START[task], rng)
         world.vary(rng)
         poses.append(world.object_poses())
-        hands.append(env.data.mocap_pos.copy())
+        hands.append(np.hstack([env.data.mocap_pos, env.data.mocap_quat]))
         looks.append([now - then for now, then in zip(appearance_arrays(env.model), usual, strict=True)])
         frames.append(world.composite(frame))
         assert np.array_equal(world.composite(frame), frames[-1]), "a moment that is seen twice is the same"
@@ -96,8 +102,13 @@ def drawn(task, given, size):
         stays += np.array_equal(world.composite(frame), frames[-1])
     rewards = np.array([world.reward(-1.0, rng) for _ in range(4000)])
     assert abs(rewards.mean() + 1.0) <= 4.0 * rewards.std() / np.sqrt(len(rewards)), "on average those of the rules"
-    offset_m = spread(np.array(poses)[..., :2])
-    assert 0.95 * width_m < offset_m <= width_m * (1 + 1e-9)
+    off, hands_off = (np.ptp(places_of(each), axis=0) / 2 for each in (poses, hands))
+    for found, widths in (
+        (off, [level.object_offset_m] * 2 + [0.0, level.object_yaw_rad]),
+        (hands_off, [level.hand_offset_m] * 3 + [level.hand_yaw_rad]),
+    ):
+        assert (found <= np.multiply(widths, 1 + 1e-9) + 1e-12).all() and (found >= np.multiply(widths, 0.75)).all()
+    offset_m = off[:, :2].max()
     *lights, colors, places, turns = (np.array(each) for each in zip(*looks, strict=True))
     shown = np.array(frames)
     brightest = shown.sum(axis=3).reshape(len(shown), -1).argmax(axis=1)
@@ -107,7 +118,7 @@ def drawn(task, given, size):
         "size": size,
         "objects mm": 1e3 * offset_m,
         "turned": spread(np.array(poses)[..., 3:]),
-        "hands mm": 1e3 * spread(hands),
+        "hands mm": 1e3 * hands_off[:, :3].max(),
         "light": max(np.abs(each).max() for each in lights),
         "red, green, blue": np.abs(colors[..., :3]).max(axis=(0, 1)),
         "camera mm": 1e3 * np.abs(places).max(),

@@ -6,6 +6,7 @@ from contextlib import closing
 
 import gymnasium
 import numpy as np
+import pytest
 from imagine_bench.tasks.arrows.world import ArrowWorld
 from imagine_bench.tasks.scenes.appearance import Appearance, appearance
 from imagine_bench.tasks.scenes.fragments import draw_composite
@@ -16,7 +17,6 @@ from imagine_bench.interfaces import HELD_OUT
 
 PHOTO, HELD = appearance("photo"), appearance(HELD_OUT["photo"])
 STATE = (2, 0, 1, 1)
-TOP = 34
 
 
 def drawn_poses(level, draws):
@@ -42,13 +42,17 @@ def test_pools_hold_fifty_hands_and_sixteen_arrows():
         assert not {tuple(pose) for pose in seen} & {tuple(pose) for pose in held}
 
 
-def test_light_is_the_fragment_s_and_changes_at_the_seams_alone():
+@pytest.mark.parametrize(
+    ("size", "objects", "top", "seams"),
+    [(64, (0, 1, 2), 34, [21, 43]), (96, (0, 1, 2, 3), 51, [24, 48, 72]), (256, (3, 1), 136, [128])],
+)
+def test_light_is_the_fragment_s_and_changes_at_the_seams_alone(size, objects, top, seams):
     level = Appearance(name="fixed", object_offset_m=0.0, object_yaw_rad=0.0, pool=1, light_fraction=0.15)
-    photograph = draw_composite(level, (0, 1, 2), 0, np.random.default_rng(3))
-    image = photograph.of(np.full((64, 64, 3), 128, np.uint8)).astype(int)[..., 0]
-    down, across = np.abs(np.diff(image, axis=0)).max(axis=1), np.abs(np.diff(image[TOP:], axis=1)).max(axis=0)
-    assert np.flatnonzero(down > 3).tolist() == [TOP - 1]
-    assert np.flatnonzero(across > 4).tolist() == [20, 42]
+    photograph = draw_composite(level, objects, 0, np.random.default_rng(3))
+    image = photograph.of(np.full((size, size, 3), 128, np.uint8)).astype(int)[..., 0]
+    down, across = np.abs(np.diff(image, axis=0)).max(axis=1), np.abs(np.diff(image[top:], axis=1)).max(axis=0)
+    assert (1 + np.flatnonzero(down > 3)).tolist() == [top]
+    assert (1 + np.flatnonzero(across > 4)).tolist() == seams
     assert 108 <= image.min() and image.max() <= 148
 
 
