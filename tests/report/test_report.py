@@ -19,10 +19,9 @@ from imagine_bench import statistics
 from imagine_bench.errors import ArtefactError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.registry.entries import FIRST, TODAY
-from imagine_bench.report import bench_page, write_report
-from imagine_bench.report.bench import shown, verdict
+from imagine_bench.report.bench import bench_page, shown, verdict
 from imagine_bench.report.data import DIFFERENCE, SCORE, collect
-from imagine_bench.report.page import Page, Table, number
+from imagine_bench.report.page import Page, Table, number, write_page
 from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
 
 
@@ -53,7 +52,7 @@ def many(tmp_path_factory: pytest.TempPathFactory) -> BenchResult:
 @pytest.fixture(scope="module")
 def folder(result: BenchResult) -> Path:
     """The report, written with all its figures."""
-    return write_report(result).parent
+    return write_page(result.folder / "report", bench_page(result)).parent
 
 
 def table(page: Page, name: str) -> Table:
