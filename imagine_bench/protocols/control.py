@@ -67,11 +67,6 @@ _AT_LEAST = {
 }
 
 
-def _set(section: object, name: str, value: object) -> None:
-    """Replace a value of a frozen section by its one spelling."""
-    object.__setattr__(section, name, value)
-
-
 @dataclass(frozen=True, kw_only=True)
 class WorldSection:
     """The world, in training and in tests."""
@@ -90,16 +85,17 @@ class WorldSection:
     def _check_world(self) -> None:
         """Write each choice in one way. Raises InvalidValueError or UnknownNameError for a value out of range."""
         require_known("execution", self.execution, EXECUTIONS)
-        _set(self, "appearance", appearance_name(self.appearance))
+        object.__setattr__(self, "appearance", appearance_name(self.appearance))
         settings = dataclasses.asdict(PhysicsSettings.of(dict(self.physics)))
-        _set(self, "physics", tuple(sorted(settings.items() - dataclasses.asdict(PhysicsSettings()).items())))
+        changed = settings.items() - dataclasses.asdict(PhysicsSettings()).items()
+        object.__setattr__(self, "physics", tuple(sorted(changed)))
         if self.physics and self.execution == "kinematic":
             raise InvalidValueError("Physics settings change nothing in kinematic execution; leave one of them out.")
         parts = tuple(self.observation.split(","))
         for part in parts:
             require_known("observation", part, OBSERVATIONS)
         require_different("observation", parts)
-        _set(self, "observation", ",".join(sorted(parts, key=OBSERVATIONS.index)))
+        object.__setattr__(self, "observation", ",".join(sorted(parts, key=OBSERVATIONS.index)))
         low, high = OBSERVATION_SIZES_PX
         if not low <= self.observation_size <= high:
             raise InvalidValueError(f"observation_size is {brief(self.observation_size)}; give {low} to {high} pixels.")
@@ -237,7 +233,7 @@ class Protocol(WorldSection, LearnerSection, BudgetSection, EvaluationSection, P
         self._check_world()
         self._check_budget()
         if self.test_appearance is not None:
-            _set(self, "test_appearance", appearance_name(self.test_appearance))
+            object.__setattr__(self, "test_appearance", appearance_name(self.test_appearance))
         if self.dataset is not None and not self.shows_frames_alone:
             raise InvalidValueError("A dataset holds 64 x 64 frames alone; leave the observation as it is by default.")
 
