@@ -53,6 +53,8 @@ from imagine_bench.values import Setting
 
 TASK_CODE = "task "
 """Beginning of the names of tasks in :attr:`.ProtocolData.code`; no agent's name has a space."""
+_FOLDERS = ("report", "tensorboard", "wandb", "why")
+"""Folders of a bench that are no agent's."""
 _AFTER_EPISODES = 100
 _AT_LEAST = {
     "after_episodes": 1,
@@ -329,8 +331,10 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
         values["split"] = split_of(spec.rules, values["split"]).identity
     wanted = Protocol(task=spec.id, preset=preset, **values)
     agents = {*wanted.agents}
+    same = wanted.test_appearance == wanted.appearance  # then it says nothing, and belongs in no hash
     wanted = dataclasses.replace(
         wanted,
+        test_appearance=None if same else wanted.test_appearance,
         headlines=tuple(pair for pair in wanted.headlines if agents.issuperset(pair)),
         few_seeds=tuple(
             (agent, wanted.seeds[most - 1])
@@ -341,6 +345,8 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     code = (*registered_code(wanted.agents), *package_digests(wanted.code_places()))
     wanted = dataclasses.replace(wanted, code=tuple(sorted(code)))
     for agent in wanted.agents:  # a protocol that is only read may be of a package that is not here
+        if agent in _FOLDERS:
+            raise InvalidValueError(f"A bench keeps files of its own in its folder {agent!r}; call the agent otherwise.")
         _require_takes(agent, wanted)
         _require_exact_world(agent, wanted)
     _require_learner(wanted)

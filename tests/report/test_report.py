@@ -154,6 +154,7 @@ def test_a_difference_is_shown_only_after_holms_correction(many: BenchResult) ->
     ("changes", "words"),
     [
         ({"demonstrations": 4}, "first training episodes demonstrated: 4"),
+        ({"demonstrations": 1_000_000}, "first training episodes demonstrated: 6,000"),
         ({"queries": 2}, "up to 2 oracle queries an episode"),
         ({"feedback": 5.0, "feedback_error": 0.2}, "a teacher's feedback of 5, wrong in 20.0 %"),
         ({"after": ("arrow_puzzle_hard",)}, "trained before on arrow_puzzle_hard, 100 episodes each"),
