@@ -191,7 +191,7 @@ class KeyboardGame(gymnasium.Wrapper[Frame, Action, Frame, Action]):
         if rollout is None:
             return np.full_like(self._start, 200), "nothing yet"
         kept = "would be learned from" if rollout.accepted[-1] else "would be filtered out"
-        return np.rint(255 * np.clip(rollout.frames[-1], 0.0, 1.0)).astype(np.uint8), (
+        return np.rint(255 * rollout.frames[-1]).astype(np.uint8), (
             f"reward {rollout.rewards[-1]:+.1f}, end {rollout.p_terminated[-1]:.0%}\n\nuncertainty\n"
             f"    epistemic {rollout.epistemic[-1]:.3g}\n    aleatoric {rollout.aleatoric[-1]:.3g}\n"
             f"    modal {rollout.modal[-1]:.3g}\n{kept}\n\nforeseen {self.foreseen} of {self.imagined}"
