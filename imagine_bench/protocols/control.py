@@ -346,7 +346,7 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     wanted = dataclasses.replace(wanted, code=tuple(sorted(code)))
     for agent in wanted.agents:  # a protocol that is only read may be of a package that is not here
         if agent in _FOLDERS:
-            raise InvalidValueError(f"A bench keeps files of its own in its folder {agent!r}; call the agent otherwise.")
+            raise InvalidValueError(f"A bench has a folder {agent!r} of its own; give the agent another name.")
         _require_takes(agent, wanted)
         _require_exact_world(agent, wanted)
     _require_learner(wanted)

@@ -82,7 +82,7 @@ def test_tests_at_the_appearance_of_training_change_no_hash():
 @pytest.mark.parametrize("name", ["report", "tensorboard", "wandb", "why"])
 def test_no_agent_shares_a_folder_with_files_of_the_bench(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.setitem(registry.AGENTS, name, registry.AGENTS["random"])
-    with pytest.raises(InvalidValueError, match=f"files of its own in its folder '{name}'; call the agent otherwise"):
+    with pytest.raises(InvalidValueError, match=f"A bench has a folder '{name}' of its own"):
         protocol("arrow_puzzle", agents=("dqn", name))
     assert protocol("arrow_puzzle", agents=("dqn", "random")).agents == ("dqn", "random")
 
