@@ -101,8 +101,8 @@ class DemonstrationData:
             found = read_arrays(path, what)
             images = {name.removeprefix("image."): each for name, each in found.items() if name.startswith("image.")}
             named = {name: found[name] for name in _NAMES}
-            said = {name: str(found.get(name, "")) for name in ("observation", "world")}
-            return cls(images=images, **named, **said)
+            observation = str(found.get("observation", ""))
+            return cls(images=images, **named, observation=observation, world=str(found.get("world", "")))
 
 
 def collect(
