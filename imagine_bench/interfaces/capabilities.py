@@ -48,8 +48,8 @@ class ImaginedRollout:
         for name in ("frames", "start_frame"):
             image = np.asarray(getattr(self, name))
             if not (np.abs(image - 0.5) <= 0.5 + _ROUNDING).all():  # no NaN is either
-                low, high = image.min(), image.max()
-                raise InvalidValueError(f"imagine() gave {name} from {low:.3g} to {high:.3g}; give values from 0 to 1.")
+                found = f"from {image.min():.3g} to {image.max():.3g}"
+                raise InvalidValueError(f"imagine() gave {name} {found}; give values from 0 to 1.")
 
 
 @runtime_checkable
