@@ -354,7 +354,7 @@ def register_agent(name: str, make: MakeAgent | str, **options: Any) -> None:
 def _name(agent: str | MakeAgent) -> str:
     """The name of an agent; a class or function that is not registered yet is registered by its own.
 
-    One that was registered, once, and has been changed since keeps its name and its other fields.
+    One that was registered and has been changed since keeps its name and its other fields, of several names the last.
     """
     if isinstance(agent, str):
         return agent
@@ -362,7 +362,7 @@ def _name(agent: str | MakeAgent) -> str:
     made_by = {name: entry.make for name, entry in registry.AGENTS.items() if isinstance(entry.make, CodeByValue)}
     same = [name for name, make in made_by.items() if make == code]
     former = [name for name, make in made_by.items() if (make.home, make.name) == (code.home, code.name)]
-    for name in same or (former if len(former) == 1 else ()):
+    for name in same or former[-1:]:
         registry.AGENTS[name] = dataclasses.replace(registry.AGENTS[name], make=code)
         return name
     name = code.name.rpartition(".")[2]

@@ -14,7 +14,7 @@ from pathlib import Path
 from imagine_bench.errors import SetupError
 
 PLATFORMS = ("egl", "glfw", "osmesa")
-_ALSO = {"", "glx", *("disable", "disabled", "off", "false", "0"), *("enable", "enabled", "on", "true", "1")}
+_ALSO = {"", "glx", "disable", "disabled", "off", "false", "0", "enable", "enabled", "on", "true", "1"}
 """Values that MuJoCo takes too: drawing switched off, which the first image then says, or left to it."""
 
 

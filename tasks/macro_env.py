@@ -137,8 +137,6 @@ class MacroEnv(SceneEnv):
         self.preprocessing = spec.preprocessing
         self.action_names = spec.action_names
         self.horizon = spec.horizon
-        self._sight = spec.sight
-        self._lag = spec.sight.lag if spec.sight else 0
         self._steps = 0
         self._observations: tuple[Observed, ...] = ()
         late = (observation, size) if self._lag else ()  # a state holds the observations under way
@@ -175,8 +173,7 @@ class MacroEnv(SceneEnv):
         Raises:
             InvalidValueError: As :meth:`step`.
         """
-        if not self.begun:
-            raise InvalidValueError("There is no episode to go on with; call reset() first.")
+        self._require_begun()
         chosen = self.checked(action)
         self._steps += 1
         self.begun = False  # until the scene is a macrostate again: a simulation that blows up ends the episode

@@ -84,6 +84,8 @@ class SceneEnv(FilmedScene, gymnasium.Env[Observed, Any]):
         self._image_of = image
         self.camera_for_people = image[0]
         self.begun = False
+        self._sight = spec.sight
+        self._lag = spec.sight.lag if spec.sight else 0
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Observed, Info]:
         """Start an episode.
@@ -161,6 +163,10 @@ class SceneEnv(FilmedScene, gymnasium.Env[Observed, Any]):
     @abc.abstractmethod
     def _put_state(self, state: Any) -> None:
         """Take over a state of this kind of environment; one that is damaged may raise anything halfway."""
+
+    def _require_begun(self) -> None:
+        if not self.begun:
+            raise InvalidValueError("There is no episode to go on with; call reset() first.")
 
     def _require_values(self, macrostate: State) -> None:
         """Raise InvalidValueError: a macrostate has not one value for each of its names."""

@@ -426,6 +426,7 @@ def test_every_option_of_the_command_is_a_keyword(tmp_path: Path) -> None:
 
 
 def test_a_class_that_is_changed_keeps_its_name_and_fields() -> None:
+    imagine_bench.register_agent("earlier", Shifting)
     imagine_bench.register_agent("mine", Shifting, title="my own", observes=("frame", "state"))
     imagine_bench.register_agent("made", code()["make"])
     first = registry.AGENTS["mine"]
@@ -436,6 +437,7 @@ def test_a_class_that_is_changed_keeps_its_name_and_fields() -> None:
     now = registry.AGENTS["mine"]
     assert "Shifting" not in registry.AGENTS and "make" not in registry.AGENTS and "MyAgent" in registry.AGENTS
     assert now.make != first.make and dataclasses.replace(now, make=first.make) == first
+    assert registry.AGENTS["earlier"].make == first.make, "of two names the last"
     for make in ("imagine_bench.agents:nope", changed):
         imagine_bench.register_agent("mine", make)
     assert registry.AGENTS["mine"].make == now.make, "a second call replaces it"

@@ -112,11 +112,11 @@ class Encoder:
     def decode(self, latents: Tensor) -> Floats32:
         """One image of the whole view for every row of ``latents`` (N, Z), as :func:`view` shapes it, in [0, 1].
 
-        Those of another package's encoder are as it draws them, or gray (N, 64, 64).
+        Those of another package's encoder are as it draws them, as far as values are in range, or gray (N, 64, 64).
         """
         latents = latents.to(self.device)
         if self.card.offer:
-            return self.network.decode(latents, 64, 64).numpy()
+            return self.network.decode(latents, 64, 64).clamp(0.0, 1.0).numpy()
         _, height, width = image_shape(self.card.preprocessing)
         return view(self.network.decode(latents, height, width).cpu().numpy(), self.card.preprocessing)
 

@@ -10,25 +10,15 @@ import shlex
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 from imagine_bench import registry
-from imagine_bench.errors import InvalidValueError, lacking, plain, require_known, require_modules
+from imagine_bench.errors import InvalidValueError, plain, require_known, require_modules
 from imagine_bench.protocols.data import Failure, Job, Launcher, OnProgress, Progress, Result
 from imagine_bench.store import run_folder
 from imagine_bench.store.files import make_folder, reading, table_rows
 
 Scalars = Mapping[str, float]
-
-
-class RunWriter(Protocol):
-    """Where the scalars of one run go."""
-
-    def add(self, scalars: Scalars, episodes: int) -> None:
-        """Write scalars after so many real training episodes."""
-
-    def close(self) -> None:
-        """Write the metrics that are left."""
 
 
 def track(folder: Path, tool: str) -> Path:
@@ -180,10 +170,8 @@ class _Run:
 
 class _TensorBoard:
     def __init__(self, out: Path, run: Path) -> None:
-        try:
-            from tensorboard.summary import Writer  # noqa: PLC0415 - an extra
-        except ImportError as error:
-            raise lacking("tensorboard") from error
+        from tensorboard.summary import Writer  # noqa: PLC0415 - an extra
+
         self._writer = Writer(str(out / run))
 
     def add(self, scalars: Scalars, episodes: int) -> None:
@@ -199,10 +187,8 @@ class _Wandb:
     _open: ClassVar[set[_Wandb]] = set()
 
     def __init__(self, out: Path, run: Path) -> None:
-        try:
-            import wandb  # noqa: PLC0415 - an extra
-        except ImportError as error:
-            raise lacking("wandb") from error
+        import wandb  # noqa: PLC0415 - an extra
+
         quiet = wandb.Settings(
             console="off", silent=True, x_disable_stats=True, x_disable_meta=True, disable_git=True, save_code=False
         )
@@ -228,5 +214,7 @@ class _Wandb:
             self._teardown()  # ends its service, which writes the files
 
 
+RunWriter = _TensorBoard | _Wandb
+"""Where the scalars of one run go."""
 TOOLS: dict[str, Callable[[Path, Path], RunWriter]] = {"tensorboard": _TensorBoard, "wandb": _Wandb}
 """The tools by name, each the class that writes a run below the folder of a bench."""

@@ -368,7 +368,7 @@ class Plan(OfBench):
 
 
 _PAGES = {
-    "control": "imagine_bench.report:bench_page",
+    "control": "imagine_bench.report.bench:bench_page",
     "regression": "imagine_bench.report.regression:report_page",
     "study": "imagine_bench.report.sweep:study_page",
     "suite": "imagine_bench.report.sweep:suite_page",

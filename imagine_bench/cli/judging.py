@@ -27,7 +27,7 @@ from imagine_bench.data.folder import read_card
 from imagine_bench.data.motion import read_demonstrations
 from imagine_bench.errors import ArtefactError, CheckFailedError, InvalidValueError, RunFailedError
 from imagine_bench.interfaces import APPEARANCES
-from imagine_bench.judge.judgement import Judgement, judge, kept
+from imagine_bench.judge.judgement import SAMPLES, SIZES, Judgement, judge, kept
 from imagine_bench.judge.verify import cost
 from imagine_bench.running.collect import POLICIES
 from imagine_bench.running.launchers.jobs import at_a_time, launcher
@@ -55,11 +55,11 @@ class Judge:
     models: Words = None
     """World models, as 'imagine-bench list' names them, or folders of a finished run or of all of an agent's; by
     default all of this suite but slow ones."""
-    sizes: tuple[int, ...] = (100, 300, 1000, 3000, 10000)
+    sizes: tuple[int, ...] = SIZES
     """Transitions of the same data after which models are compared, ascending."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds, each of data and of models."""
-    samples: int = 8
+    samples: int = SAMPLES
     """Futures imagined of each question."""
     appearance: str = APPEARANCES[0]
     """How much frames vary: a level, or factors such as light=0.5,camera=0.2."""
@@ -97,10 +97,9 @@ class Judge:
             encoder=self.encoder,
         )
         folder, failed = judge(judgement, self.out, workers=workers)
-        if not kept(folder, judgement):  # a report without a model would replace one of other models
-            raise RunFailedError("\n".join(failed))
-        write_report(judgement_page(judged(folder, judgement)), folder / "report")
-        print(f"Recording: {record_judgement(folder, judgement)}")
+        if kept(folder, judgement):  # a report without a model would replace one of other models
+            write_report(judgement_page(judged(folder, judgement)), folder / "report")
+            print(f"Recording: {record_judgement(folder, judgement)}")
         if failed:
             raise RunFailedError("\n".join(failed))
 

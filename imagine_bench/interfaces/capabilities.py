@@ -16,10 +16,17 @@ from imagine_bench.arrays import Bools, Floats, Floats32, Frame, Ints, Pixels
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.observation import Observation
 
+_ROUNDING = 0.001
+"""Values of images so far out of range are no fault: they are less than a step of an image of bytes."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ImaginedRollout:
-    """An imagined rollout from one real frame; index d is the imagined result of ``actions[d]``."""
+    """An imagined rollout from one real frame; index d is the imagined result of ``actions[d]``.
+
+    Raises:
+        InvalidValueError: An image has values out of range.
+    """
 
     actions: Ints  #: macro-actions imagined. Shape (D,), int64.
     #: decoded latents as images of the whole view in [0, 1], gray (D, H', W') or RGB (D, H', W', 3)
@@ -36,6 +43,13 @@ class ImaginedRollout:
     #: whether the filter keeps the transition (False from the first rejected one on). Shape (D,).
     accepted: Bools
     macrostates: Ints  #: the macrostate a probe reads from each imagined latent. Shape (D, M).
+
+    def __post_init__(self) -> None:
+        for name in ("frames", "start_frame"):
+            image = np.asarray(getattr(self, name))
+            if not (np.abs(image - 0.5) <= 0.5 + _ROUNDING).all():  # no NaN is either
+                found = f"from {image.min():.3g} to {image.max():.3g}"
+                raise InvalidValueError(f"imagine() gave {name} {found}; give values from 0 to 1.")
 
 
 @runtime_checkable

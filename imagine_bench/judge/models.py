@@ -71,7 +71,7 @@ class AgentModel(Untaught):
             del uncertain["aleatoric"]
         rewards, p_ended = until_the_end(stacked("rewards"), stacked("p_terminated"))
         return Imagined(
-            pictures=(stacked("frames").clip(0.0, 1.0) * 255.0).round().astype(np.uint8),
+            pictures=(stacked("frames") * 255.0).round().astype(np.uint8),
             rewards=rewards,
             p_ended=p_ended,
             accepted=stacked("accepted").mean(axis=1) >= _MOST,

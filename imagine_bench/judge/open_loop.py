@@ -16,6 +16,7 @@ import numpy as np
 from imagine_bench.arrays import Floats, Frame, Ints, State, read_only
 from imagine_bench.interfaces import ObservationModel, TaskSpec
 from imagine_bench.interfaces.capabilities import ImaginedRollout, Imaginer, begin_episode
+from imagine_bench.interfaces.model import UNCERTAINTIES
 from imagine_bench.judge.questions import EvalSet, some_starts
 from imagine_bench.judge.truth import added_up, expected_reward, shares
 from imagine_bench.rules import Outcomes, advance, is_random
@@ -145,7 +146,7 @@ def open_loop(agent: Imaginer, questions: EvalSet, seeds: SeedTree) -> OpenLoop:
     kept = accepted.sum(axis=0)
     began = np.pad(correct[:, :-1], ((0, 0), (1, 0)), constant_values=True)
     uncertain = {}
-    for cause in ("epistemic", "aleatoric", "modal"):
+    for cause in UNCERTAINTIES:
         values = stacked(cause)
         columns = zip(values.T, correct.T, began.T, strict=True)
         uncertain[cause] = values.mean(axis=0)

@@ -82,10 +82,8 @@ def make_plans(
     does, is refused; None leaves the verdict to that filter. The agent is not changed.
 
     Raises:
-        InvalidValueError: Fewer than one plan, or an agent that does not imagine.
+        InvalidValueError: The agent does not imagine.
     """
-    if count < 1:
-        raise InvalidValueError(f"{count} plans show nothing; give at least 1.")
     with closing(make_env(trained, execution)) as env:
         for number in range(count):
             yield carry_out(env, trained, number, max_epistemic=max_epistemic)

@@ -19,13 +19,12 @@ from pathlib import Path
 import numpy as np
 
 from imagine_bench import registry
-from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError, brief, require
+from imagine_bench.errors import ArtefactError, InvalidValueError, brief, require
 from imagine_bench.exact.certificate import Certificate
 from imagine_bench.interfaces.environments import Env
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import digest
 from imagine_bench.protocols.presets import PRESETS
-from imagine_bench.registry.entries import AgentEntry
 from imagine_bench.registry.machine import commit
 from imagine_bench.rules import fewest_actions
 from imagine_bench.running.bench import certificate_of, counted
@@ -149,7 +148,7 @@ class _RunCheck:
         self.run = run = run_folder.load_run(self.folder)
         self.snapshot = snapshot = run_folder.load_newest(self.folder / run_folder.CHECKPOINTS)
         self.is_older = run_folder.read_config(self.folder)["format"] == run_folder.WITHOUT_TRAINING
-        self.entry = _entry_of(self.agent)
+        self.entry = registry.known_entry(self.agent)
         budgets = self.protocol.budgets
         learns = len(run.training_success) > 0 if self.entry is None else self.entry.learns
         self.trained = budgets[-1] if learns else 0
@@ -228,13 +227,6 @@ class _RunCheck:
         return marks
 
 
-def _entry_of(agent: str) -> AgentEntry | None:
-    """The registry line of an agent; None where its package is not here."""
-    with suppress(UnknownNameError, SetupError):
-        return registry.agent_entry(agent)
-    return None
-
-
 def _of_dataset(protocol: Protocol) -> int:
     """The episodes of the dataset that comes first in training."""
     found = _OF_DATASET.search(protocol.dataset or "")
@@ -269,7 +261,7 @@ def _verify_protocol(folder: Path, protocol: Protocol, runs: Mapping[str, RunRes
     facts = bench_facts(folder)
     is_older = any(run.training is None for run in runs.values())
     unshown = [*_settings(protocol, runs), *_seeds(protocol, facts["environment"]["sessions"])]
-    entries = [_entry_of(agent) for agent in protocol.agents]
+    entries = [registry.known_entry(agent) for agent in protocol.agents]
     codes = protocol.codes if protocol.codes != protocol.encoder else None  # one file may serve both kinds
     for kind, used in (("latents", protocol.encoder), ("codes", codes)):
         is_read = any(entry is None or (entry.needs_encoder and entry.encoder_kind == kind) for entry in entries)
@@ -315,7 +307,7 @@ def _seeds(protocol: Protocol, sessions: Sequence[Mapping[str, str]]) -> list[st
 def _settings(protocol: Protocol, runs: Mapping[str, RunResult]) -> list[str]:
     """Compare the learners' settings with the protocol's digest. Returns claims that cannot be shown."""
     learners = {agent: run for agent, run in runs.items() if len(run.training_success)}
-    entries = {agent: _entry_of(agent) for agent in learners}
+    entries = {agent: registry.known_entry(agent) for agent in learners}
     able = {agent for agent, entry in entries.items() if entry is None or entry.settings}
     silent = [agent for agent in learners if agent in able and not learners[agent].settings]
     if silent:

@@ -53,6 +53,8 @@ from imagine_bench.values import Setting
 
 TASK_CODE = "task "
 """Beginning of the names of tasks in :attr:`.ProtocolData.code`; no agent's name has a space."""
+_FOLDERS = ("report", "tensorboard", "wandb", "why")
+"""Folders of a bench that are no agent's."""
 _AFTER_EPISODES = 100
 _AT_LEAST = {
     "after_episodes": 1,
@@ -65,11 +67,6 @@ _AT_LEAST = {
     "recorded_episodes": 0,
     "recorded_seeds": 0,
 }
-
-
-def _set(section: object, name: str, value: object) -> None:
-    """Replace a value of a frozen section by its one spelling."""
-    object.__setattr__(section, name, value)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,16 +87,17 @@ class WorldSection:
     def _check_world(self) -> None:
         """Write each choice in one way. Raises InvalidValueError or UnknownNameError for a value out of range."""
         require_known("execution", self.execution, EXECUTIONS)
-        _set(self, "appearance", appearance_name(self.appearance))
+        object.__setattr__(self, "appearance", appearance_name(self.appearance))
         settings = dataclasses.asdict(PhysicsSettings.of(dict(self.physics)))
-        _set(self, "physics", tuple(sorted(settings.items() - dataclasses.asdict(PhysicsSettings()).items())))
+        changed = settings.items() - dataclasses.asdict(PhysicsSettings()).items()
+        object.__setattr__(self, "physics", tuple(sorted(changed)))
         if self.physics and self.execution == "kinematic":
             raise InvalidValueError("Physics settings change nothing in kinematic execution; leave one of them out.")
         parts = tuple(self.observation.split(","))
         for part in parts:
             require_known("observation", part, OBSERVATIONS)
         require_different("observation", parts)
-        _set(self, "observation", ",".join(sorted(parts, key=OBSERVATIONS.index)))
+        object.__setattr__(self, "observation", ",".join(sorted(parts, key=OBSERVATIONS.index)))
         low, high = OBSERVATION_SIZES_PX
         if not low <= self.observation_size <= high:
             raise InvalidValueError(f"observation_size is {brief(self.observation_size)}; give {low} to {high} pixels.")
@@ -237,7 +235,7 @@ class Protocol(WorldSection, LearnerSection, BudgetSection, EvaluationSection, P
         self._check_world()
         self._check_budget()
         if self.test_appearance is not None:
-            _set(self, "test_appearance", appearance_name(self.test_appearance))
+            object.__setattr__(self, "test_appearance", appearance_name(self.test_appearance))
         if self.dataset is not None and not self.shows_frames_alone:
             raise InvalidValueError("A dataset holds 64 x 64 frames alone; leave the observation as it is by default.")
 
@@ -333,8 +331,10 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
         values["split"] = split_of(spec.rules, values["split"]).identity
     wanted = Protocol(task=spec.id, preset=preset, **values)
     agents = {*wanted.agents}
+    same = wanted.test_appearance == wanted.appearance  # then it says nothing, and belongs in no hash
     wanted = dataclasses.replace(
         wanted,
+        test_appearance=None if same else wanted.test_appearance,
         headlines=tuple(pair for pair in wanted.headlines if agents.issuperset(pair)),
         few_seeds=tuple(
             (agent, wanted.seeds[most - 1])
@@ -345,6 +345,8 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     code = (*registered_code(wanted.agents), *package_digests(wanted.code_places()))
     wanted = dataclasses.replace(wanted, code=tuple(sorted(code)))
     for agent in wanted.agents:  # a protocol that is only read may be of a package that is not here
+        if agent in _FOLDERS:
+            raise InvalidValueError(f"A bench has a folder {agent!r} of its own; give the agent another name.")
         _require_takes(agent, wanted)
         _require_exact_world(agent, wanted)
     _require_learner(wanted)

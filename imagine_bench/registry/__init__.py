@@ -212,11 +212,17 @@ def _configured_entry(name: str, own: Mapping[str, Any], group: str) -> Any:
     return dataclasses.replace(entry, title=f"{entry.title or one.agent.replace('_', ' ')} ({one.words})")
 
 
+def known_entry(agent: str) -> AgentEntry | None:
+    """The registry line of an agent, None of one that is not installed here or whose package offers it wrongly."""
+    with suppress(UnknownNameError, InvalidValueError, SetupError):
+        return agent_entry(agent)
+    return None
+
+
 def is_player(agent: str) -> bool:
     """Whether an agent's name is that of a person, or of a program elsewhere, such as ``person:anna``."""
-    with suppress(UnknownNameError, InvalidValueError, SetupError):
-        return agent_entry(agent).is_player
-    return False
+    entry = known_entry(agent)
+    return entry is not None and entry.is_player
 
 
 def _prefixes(group: str) -> Mapping[str, Any]:

@@ -28,12 +28,20 @@ from imagine_bench.errors import InvalidValueError, SetupError, brief, plain
 
 _ADDRESS = re.compile(r" at 0x[0-9a-f]+", re.IGNORECASE)
 _INSTALLED = ("site-packages", "dist-packages")
-_NO_CODE = frozenset(
-    (
-        *("__module__", "__dict__", "__weakref__", "__doc__", "__slotnames__", "_abc_impl", "__annotations__"),
-        *("__firstlineno__", "__static_attributes__", "__annotate_func__", "__annotations_cache__"),  # since 3.13
-    )
-)
+_NO_CODE = {
+    "__module__",
+    "__dict__",
+    "__weakref__",
+    "__doc__",
+    "__slotnames__",
+    "_abc_impl",
+    "__annotations__",
+    # since 3.13
+    "__firstlineno__",
+    "__static_attributes__",
+    "__annotate_func__",
+    "__annotations_cache__",
+}
 """Attributes of a class that Python itself adds, or that change nothing that it does."""
 _Cached = functools._lru_cache_wrapper
 """A function that remembers its results."""

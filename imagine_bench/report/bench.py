@@ -106,7 +106,7 @@ def _beyond_own_episodes(protocol: Protocol) -> Iterator[str]:
         notice = ", without notice of a change" * protocol.unannounced
         yield f"trained before on {', '.join(protocol.after)}, {protocol.after_episodes:,} episodes each{notice}"
     if protocol.demonstrations:
-        yield f"first training episodes demonstrated: {protocol.demonstrations:,}"
+        yield f"first training episodes demonstrated: {min(protocol.demonstrations, protocol.budgets[-1]):,}"
     if protocol.queries:
         yield f"up to {protocol.queries:,} oracle queries an episode"
     if protocol.feedback:

@@ -34,9 +34,23 @@ GAIN = ("gain", "gain_low_95", "gain_high_95")
 AREA = ("area", "area_low_95", "area_high_95")
 _PAIRED = ("alone", "dqn_alone", "p_mcnemar")
 _SUMMARY_COLUMNS = (
-    *("agent", "episodes", "seeds", *SCORE, "interval_over", "thesis_mean", "thesis_std"),
-    *(*DIFFERENCE, "p_holm", "detectable_difference", *GAIN, "thesis_gain", *_PAIRED, "p_mcnemar_holm"),
-    *("probability_of_improvement", "excess_macro_actions", *AREA),
+    "agent",
+    "episodes",
+    "seeds",
+    *SCORE,
+    "interval_over",
+    "thesis_mean",
+    "thesis_std",
+    *DIFFERENCE,
+    "p_holm",
+    "detectable_difference",
+    *GAIN,
+    "thesis_gain",
+    *_PAIRED,
+    "p_mcnemar_holm",
+    "probability_of_improvement",
+    "excess_macro_actions",
+    *AREA,
 )
 _LOOP_COLUMNS = tuple(each.name for each in dataclasses.fields(OpenLoop))
 _ABSENT = (UnknownNameError, SetupError)

@@ -11,6 +11,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from imagine_bench.arrays import Arrays
+from imagine_bench.interfaces.model import UNCERTAINTIES
 from imagine_bench.judge.causes import CAUSES, CAUSES_OF_PLAYERS, FORMER_CAUSES
 from imagine_bench.recording.filmstrips import episode_strip, filmstrip, png, sampled_filmstrips
 from imagine_bench.registry.entries import file_name
@@ -36,7 +37,6 @@ _MEASURES = {
     "aleatoric": "aleatoric",
     "modal": "modal",
 }
-_KINDS = ("epistemic", "aleatoric", "modal")
 
 
 # Episodes ---------------------------------------------------------------------------------------------------------
@@ -148,7 +148,7 @@ def open_loop_figure(loops: Mapping[str, Arrays]) -> Figure:
     panels: dict[str, dict[str, dict[int, float]]] = {}
     for name, title in _MEASURES.items():
         scale = 100.0 if "%" in title else 1.0
-        known = {agent: loop[name] for agent, loop in loops.items() if name not in _KINDS or loop[name].any()}
+        known = {agent: loop[name] for agent, loop in loops.items() if name not in UNCERTAINTIES or loop[name].any()}
         panels[title] = {agent: dict(enumerate(scale * by_depth, 1)) for agent, by_depth in known.items()}
     return figures.lines(panels, figures.line_styles(loops), "imagined depth (macro-actions)")
 

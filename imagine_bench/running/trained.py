@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from imagine_bench import registry
-from imagine_bench.errors import AbsentError, ArtefactError, InvalidValueError, SetupError, UnknownNameError
+from imagine_bench.errors import AbsentError, ArtefactError, InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import Agent, AgentContext, AgentState, TaskSpec
 from imagine_bench.interfaces.capabilities import Imaginer, ModelOnlyTrainer
 from imagine_bench.protocols.control import Protocol, context_of
@@ -151,11 +151,8 @@ def learners(bench: Path) -> tuple[Path, ...]:
     store = BenchStore(bench, protocol)
     found = []
     for agent, seed in protocol.runs:
-        try:
-            entry = registry.agent_entry(agent)
-        except (UnknownNameError, SetupError):  # of a script, or of a package that is not installed here
-            continue
-        if entry.learns and not entry.external_training_loop:
+        entry = registry.known_entry(agent)  # none of a script, or of a package that is not installed here
+        if entry is not None and entry.learns and not entry.external_training_loop:
             folder = store.run_folder(agent, seed)
             snapshot = load_newest(folder / run_folder.CHECKPOINTS, agent=False)
             if snapshot is not None and snapshot.episode > 0:  # none on its own task: it is at those before

@@ -31,9 +31,22 @@ Runs = Mapping[tuple[str, int], RunResult | None]
 """Runs by agent and seed, None where there is nothing yet."""
 _RESULTS = "results.csv"
 _COLUMNS = (
-    *("agent", "seed", "episodes", "env_steps", "test_episodes", "successes"),
-    *("success_rate", "wilson_low", "wilson_high"),  # for a reader's comfort; they are computed anew from the counts
-    *("mean_return", "mean_length", "faults", "train_cpu_s", "eval_cpu_s", "solved"),
+    "agent",
+    "seed",
+    "episodes",
+    "env_steps",
+    "test_episodes",
+    "successes",
+    # these three are for a reader's comfort: they are computed anew from the counts
+    "success_rate",
+    "wilson_low",
+    "wilson_high",
+    "mean_return",
+    "mean_length",
+    "faults",
+    "train_cpu_s",
+    "eval_cpu_s",
+    "solved",
 )
 """Columns of every table of results; those of diagnostics follow."""
 _APART = "diagnostics/"

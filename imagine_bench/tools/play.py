@@ -80,6 +80,12 @@ class KeyboardGame(gymnasium.Wrapper[Frame, Action, Frame, Action]):
         self.foreseen = 0
         self.imagined = 0
 
+    def play_by(self, keyboard: Callable[..., None]) -> None:
+        """Let a person play until the window is closed."""
+        n_actions = self._task.n_actions
+        keys = dict(zip(KEYS, range(n_actions), strict=False))
+        keyboard(self, fps=_FPS, keys_to_action=keys, noop=n_actions)
+
     def reset(self, *, seed: int | None = None, options: dict[str, State] | None = None) -> tuple[Frame, Info]:
         """Begin an episode; only the first one is seeded, or all would begin alike."""
         self._frame, self._info = self.env.reset(seed=self._reset_seed, options=options)
@@ -185,7 +191,7 @@ class KeyboardGame(gymnasium.Wrapper[Frame, Action, Frame, Action]):
         if rollout is None:
             return np.full_like(self._start, 200), "nothing yet"
         kept = "would be learned from" if rollout.accepted[-1] else "would be filtered out"
-        return np.rint(255 * np.clip(rollout.frames[-1], 0.0, 1.0)).astype(np.uint8), (
+        return np.rint(255 * rollout.frames[-1]).astype(np.uint8), (
             f"reward {rollout.rewards[-1]:+.1f}, end {rollout.p_terminated[-1]:.0%}\n\nuncertainty\n"
             f"    epistemic {rollout.epistemic[-1]:.3g}\n    aleatoric {rollout.aleatoric[-1]:.3g}\n"
             f"    modal {rollout.modal[-1]:.3g}\n{kept}\n\nforeseen {self.foreseen} of {self.imagined}"
@@ -235,9 +241,8 @@ def play(
     require_integer("seed", seed, 0)
     keyboard = keyboard_player()
     env = gymnasium.make(spec.env_id, disable_env_checker=True, **chosen)
-    keys: dict[str, Action] = dict(zip(KEYS, range(spec.n_actions), strict=False))
     with closing(KeyboardGame(env, spec, imaginer, seed)) as game:
-        keyboard(game, fps=_FPS, keys_to_action=keys, noop=spec.n_actions)
+        game.play_by(keyboard)
     return game.summary()
 
 
@@ -249,11 +254,10 @@ def keep_playing(wanted: Protocol, root: Path, *, camera: str = "human") -> str:
     """
     keyboard = keyboard_player()
     spec = wanted.spec(testing=True)  # its exact facts are those of the tests' starts
-    keys: dict[str, Action] = dict(zip(KEYS, range(spec.n_actions), strict=False))
     with played_run(wanted, root, **_view(camera)) as run:
         game = KeyboardGame(cast("gymnasium.Env[Frame, Action]", run), spec, None, 0)
         with suppress(FinishedError), closing(game):
-            keyboard(game, fps=_FPS, keys_to_action=keys, noop=spec.n_actions)
+            game.play_by(keyboard)
         bench = run.folder.parent.parent
         return f"{game.summary()}\nNow {run.words}; kept in {bench}. The same command goes on."
 

@@ -209,8 +209,6 @@ class MotionEnv(SceneEnv):
         if not is_number or not 0.0 <= placement <= MAX_PLACEMENT_M:
             raise InvalidValueError(f"placement is {brief(placement)}; give metres from 0 to {MAX_PLACEMENT_M:g}.")
         self.placement_m = float(placement)
-        self._sight = spec.sight
-        self._lag = spec.sight.lag if spec.sight else 0
         self._n_steps = steps_in_period(rate_hz, self.model.opt.timestep)
         self.period_s = self._n_steps * self.model.opt.timestep
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.period_s)}
@@ -341,12 +339,6 @@ class MotionEnv(SceneEnv):
         targets: Floats = self.data.ctrl[self.columns.ctrl[: len(ARM_JOINTS) + 1]].copy()
         return targets
 
-    def servo_forces(self) -> Floats:
-        """The present efforts of the servos: torques of the seven joints (N m), forces of both fingers (N). Shape
-        (9,).
-        """
-        return np.asarray(self.data.actuator_force[self.columns.ctrl])
-
     def get_state(self) -> MotionState:
         """All that decides how the episode goes on, copied; of a wrapper it knows nothing."""
         return MotionState(
@@ -370,10 +362,6 @@ class MotionEnv(SceneEnv):
         self.world.set_slipping(episode.slipping)
 
     # --- details -------------------------------------------------------------------------------------------------
-
-    def _require_begun(self) -> None:
-        if not self.begun:
-            raise InvalidValueError("There is no episode to go on with; call reset() first.")
 
     def _servo_change(self, action: Floats, before: Floats) -> tuple[Floats, str]:
         """The change of the servos' commands in an action's period: joints, then fingers (9,); and the limit met."""

@@ -23,7 +23,7 @@ from imagine_bench.errors import ArtefactError, SetupError, UnknownNameError
 from imagine_bench.interfaces.environments import Wrapper
 from imagine_bench.judge.verify import Replays, has_own_failures, verdicts
 from imagine_bench.protocols.control import protocol
-from imagine_bench.report import bench_page
+from imagine_bench.report.bench import bench_page
 from imagine_bench.report.page import texts
 from imagine_bench.running.bench import bench, load_bench
 from imagine_bench.running.control import plan_control

@@ -98,6 +98,22 @@ def test_tests_in_which_nothing_failed_are_counted_too(tmp_path: Path, monkeypat
         read_causes(folder)
 
 
+def test_shares_are_those_of_the_failures_of_all_seeds_at_a_budget() -> None:
+    """Counted by hand; a row without a cause is a budget at which nothing failed."""
+    failures = {("dqn", 0, 100, 40): ["values"] * 3 + ["misread"], ("dqn", 1, 100, 60): ["values", "unlucky"],
+                ("dqn", 0, 200, 40): [""], ("dqn", 1, 200, 60): ["unlucky"], ("oracle", 0, 0, 50): [""]}  # fmt: skip
+    rows = [(*run, test, cause) for run, found in failures.items() for test, cause in enumerate(found)]
+    table = causes_table(rows)
+    header = [str(each) for each in table.header]
+    found = {tuple(row[:3]): dict(zip(header[3:], row[3:], strict=True)) for row in table.rows}
+    named = dict.fromkeys([f"{cause}, %" for cause in CAUSES], "0.0")
+    assert found == {
+        ("dqn", "100", "6 of 100"): {**named, "values, %": "66.7", "misread, %": "16.7", "unlucky, %": "16.7"},
+        ("dqn", "200", "1 of 100"): {**named, "unlucky, %": "100.0"},
+        ("oracle", "0", "0 of 50"): dict.fromkeys(named, "–"),
+    }
+
+
 @pytest.mark.parametrize("former", FORMER_CAUSES)
 def test_a_cause_by_its_former_name_counts_as_the_one_of_today(former: str) -> None:
     then, now = (causes_table([("dqn", 0, 5, 9, 1, cause)]).rows for cause in (former, FORMER_CAUSES[former]))

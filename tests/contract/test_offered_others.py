@@ -110,6 +110,8 @@ def test_an_own_representation_trains_an_agent(tmp_path: Path, capsys: pytest.Ca
     assert mu.shape == (50, 48) and float(sigma.max()) < 1e-3 and float(mu.abs().median()) < 3.0
     expected = frames.reshape(50, 4, 16, 4, 16, 3).mean(axis=(2, 4)) / 255.0
     assert np.abs(encoder.decode(mu)[:, ::16, ::16] - expected).max() < 0.01
+    far = encoder.decode(100.0 * mu)
+    assert (far.min(), far.max()) == (0.0, 1.0), "images of latents that were never seen are cut off"
     right = (encoder.read_macrostate(mu) == states).all(axis=1).mean()
     assert right > 0.2 > 4 / len(spec.rules.states)
 

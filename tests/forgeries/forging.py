@@ -26,7 +26,7 @@ from imagine_bench.interfaces import Agent, Observation
 from imagine_bench.interfaces.environments import Env
 from imagine_bench.protocols.control import Protocol, context_of
 from imagine_bench.protocols.data import Failure, Job, Launcher, OnProgress, RunSpec
-from imagine_bench.report import bench_page
+from imagine_bench.report.bench import bench_page
 from imagine_bench.report.page import write_page
 from imagine_bench.running.bench import bench, plan
 from imagine_bench.running.evaluation import EvaluationCounts, play, play_test_episode

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import bench_fakes
 import gymnasium
@@ -12,8 +13,10 @@ from judged import labelled, shown
 from numpy.typing import NDArray
 from small_runs import context
 
+from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Frame, Outcome, State, TaskSpec
 from imagine_bench.interfaces.capabilities import ImaginedRollout
+from imagine_bench.judge.models import AgentModel
 from imagine_bench.judge.open_loop import (
     EXAMPLES,
     SAMPLED_ROLLOUTS,
@@ -167,6 +170,31 @@ def test_examples_stand_beside_the_truth() -> None:
     assert starts[0] != starts[1], "a run that tunes begins elsewhere"
     few = examples(IMAGINER, PICK_PLACE, appearance="clean", seeds=SeedTree(0))
     assert len(PICK_PLACE.rules.start_states) < EXAMPLES == len(few) == len(first), "few starts have examples too"
+
+
+@pytest.mark.parametrize("name", ["frames", "start_frame"])
+@pytest.mark.parametrize("value", [255.0, -0.1, np.nan])
+def test_images_out_of_range_are_refused_by_their_name(name: str, value: float) -> None:
+    class Loud(bench_fakes.RulesImaginer):
+        def imagine(self, *args: Any, **kwargs: Any) -> ImaginedRollout:
+            rollout = super().imagine(*args, **kwargs)
+            return dataclasses.replace(rollout, **{name: np.full_like(getattr(rollout, name), value)})
+
+    said = rf"imagine\(\) gave {name} from {value:g} to {value:g}; give values from 0 to 1\."
+    with pytest.raises(InvalidValueError, match=said):
+        examples(Loud(context()), PUZZLE, appearance="clean", seeds=SeedTree(0))
+
+
+@pytest.mark.parametrize(("value", "byte"), [(1.0005, 255), (-0.0005, 0), (0.5, 128)])
+def test_images_that_rounding_put_out_of_range_are_shown(value: float, byte: int) -> None:
+    class Rounded(bench_fakes.RulesImaginer):
+        def imagine(self, *args: Any, **kwargs: Any) -> ImaginedRollout:
+            rollout = super().imagine(*args, **kwargs)
+            return dataclasses.replace(rollout, frames=np.full_like(rollout.frames, value))
+
+    frames, actions = np.zeros((1, 1, 64, 64, 3), dtype=np.uint8), np.zeros((1, 2), dtype=np.int64)
+    pictures = AgentModel(Rounded(context())).imagine(frames, actions, 1, np.random.default_rng(0)).pictures
+    assert (pictures == byte).all()
 
 
 @pytest.mark.parametrize("lag", [0, 1])

@@ -28,7 +28,7 @@ from imagine_bench.recording.filmstrips import (
     rgb,
     sampled_filmstrips,
 )
-from imagine_bench.report import bench_page
+from imagine_bench.report.bench import bench_page
 from imagine_bench.report.levels import film_image
 from imagine_bench.store.results import ComparedRollout, RecordedEpisode
 

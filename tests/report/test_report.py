@@ -19,10 +19,9 @@ from imagine_bench import statistics
 from imagine_bench.errors import ArtefactError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.registry.entries import FIRST, TODAY
-from imagine_bench.report import bench_page, write_report
-from imagine_bench.report.bench import shown, verdict
+from imagine_bench.report.bench import bench_page, shown, verdict
 from imagine_bench.report.data import DIFFERENCE, SCORE, collect
-from imagine_bench.report.page import Page, Table, number
+from imagine_bench.report.page import Page, Table, number, write_page
 from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
 
 
@@ -53,7 +52,7 @@ def many(tmp_path_factory: pytest.TempPathFactory) -> BenchResult:
 @pytest.fixture(scope="module")
 def folder(result: BenchResult) -> Path:
     """The report, written with all its figures."""
-    return write_report(result).parent
+    return write_page(result.folder / "report", bench_page(result)).parent
 
 
 def table(page: Page, name: str) -> Table:
@@ -155,6 +154,7 @@ def test_a_difference_is_shown_only_after_holms_correction(many: BenchResult) ->
     ("changes", "words"),
     [
         ({"demonstrations": 4}, "first training episodes demonstrated: 4"),
+        ({"demonstrations": 1_000_000}, "first training episodes demonstrated: 6,000"),
         ({"queries": 2}, "up to 2 oracle queries an episode"),
         ({"feedback": 5.0, "feedback_error": 0.2}, "a teacher's feedback of 5, wrong in 20.0 %"),
         ({"after": ("arrow_puzzle_hard",)}, "trained before on arrow_puzzle_hard, 100 episodes each"),

@@ -11,7 +11,7 @@ from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.protocols.control import protocol
 from imagine_bench.registry.entries import file_name, parse_configuration
-from imagine_bench.report import summary_table
+from imagine_bench.report.bench import bench_page
 from imagine_bench.report.figures import color
 from imagine_bench.running.bench import bench, plan
 from imagine_bench.running.control import resolved_settings
@@ -65,7 +65,7 @@ def test_one_agent_with_two_settings_in_one_table(tmp_path: Path) -> None:
     trained = load_trained(both.folder / "dqn-controller.discount=0.99" / "seed_0")
     assert trained.agent.settings.controller.discount == 0.99
     assert [both.of(agent)[0].settings["controller"]["discount"] for agent in ("dqn", SLOW)] == [0.95, 0.99]
-    assert summary_table(both).count(SLOW) >= 1
+    assert bench_page(both).summary.count(SLOW) >= 1
     for name, content in archive_files(both).items():
         (tmp_path / name).write_text(content)
     assert load_so_far(tmp_path).of(SLOW)[0].checkpoints[0].successes == both.of(SLOW)[0].checkpoints[0].successes

@@ -6,6 +6,7 @@ import shutil
 
 import pytest
 
+from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnableError
 from imagine_bench.interfaces import APPEARANCES
 from imagine_bench.protocols.control import Protocol, protocol
@@ -68,6 +69,22 @@ def test_a_whole_number_is_spelled_as_any_other(changes):
     (name, value), *_ = changes.items()
     other = {name: 1.0 if value == 1 else {"pad_friction": 1.0}}
     assert protocol("arrow_puzzle", **changes).hash == protocol("arrow_puzzle", **other).hash
+
+
+def test_tests_at_the_appearance_of_training_change_no_hash():
+    factors = "light=0.25,camera=0.5"
+    for appearance, same in (("clean", "clean"), ("photo", "photo"), (factors, "camera=0.5,light=0.25")):
+        alone = protocol("arrow_puzzle", appearance=appearance)
+        assert protocol("arrow_puzzle", appearance=appearance, test_appearance=same).hash == alone.hash
+        assert protocol("arrow_puzzle", appearance=appearance, test_appearance="strong").hash != alone.hash
+
+
+@pytest.mark.parametrize("name", ["report", "tensorboard", "wandb", "why"])
+def test_no_agent_shares_a_folder_with_files_of_the_bench(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setitem(registry.AGENTS, name, registry.AGENTS["random"])
+    with pytest.raises(InvalidValueError, match=f"A bench has a folder '{name}' of its own"):
+        protocol("arrow_puzzle", agents=("dqn", name))
+    assert protocol("arrow_puzzle", agents=("dqn", "random")).agents == ("dqn", "random")
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,8 @@ from small_runs import Inline, small
 
 from imagine_bench import registry
 from imagine_bench.errors import ArtefactError
-from imagine_bench.report import summary_table, write_report
+from imagine_bench.report.bench import bench_page
+from imagine_bench.report.page import texts
 from imagine_bench.running import bench as benches
 from imagine_bench.store.loading import load_so_far
 from imagine_bench.store.results import BenchResult
@@ -52,8 +53,8 @@ def test_a_bench_lacks_its_unfinished_runs_alone(tmp_path: Path) -> None:
         benches.load_bench(folder)
     elsewhere = shutil.copytree(folder, tmp_path / "carried elsewhere")
     assert load_so_far(elsewhere).protocol == part.protocol
-    assert "1 of 2 seeds up to 9 of 9 real episodes" in summary_table(part)
-    assert "This bench is not finished" in write_report(part).read_text()
+    assert "1 of 2 seeds up to 9 of 9 real episodes" in bench_page(part).summary
+    assert "This bench is not finished" in texts(bench_page(part))["index.html"]
 
     launcher = Inline()
     result = bench(tmp_path, launcher)

@@ -18,7 +18,8 @@ from small_runs import Inline, small
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.protocols.control import Protocol
-from imagine_bench.report import summary_table, write_report
+from imagine_bench.report.bench import bench_page
+from imagine_bench.report.page import write_page
 from imagine_bench.running.bench import bench, load_bench
 from imagine_bench.running.evaluation import EvaluationCounts
 from imagine_bench.store.loading import archive_files, cut, load_so_far, merge
@@ -47,7 +48,10 @@ def do(root: Path, *agents: str, **changes: Any) -> Path:
 
 def kept_from(folder: Path, kept: Path, joined: BenchResult | None = None) -> Path:
     """The part of a bench, or of joined ones, that is kept for good."""
-    assert write_report(joined).exists() if joined else main(["report", str(folder)]) == 0
+    if joined is None:
+        assert main(["report", str(folder)]) == 0
+    else:
+        write_page(joined.folder / "report", bench_page(joined))
     kept.mkdir()
     for name in ("bench.json", "results.csv"):
         (kept / name).write_bytes((folder / "report" / name).read_bytes())
@@ -72,9 +76,8 @@ def test_every_run_of_both_is_there_unchanged(tmp_path: Path) -> None:
     assert joined.environment["bench 2"]["command"] == own.environment["command"]
     assert joined.folder.name.startswith("merged-") and joined.missing == ()
     assert joined.left_out == ("oracle seed 0", "random seed 2")
-    assert "Left out, for some agent has not been run with that seed or one before: oracle seed 0" in summary_table(
-        joined
-    )
+    left_out = "Left out, for some agent has not been run with that seed or one before: oracle seed 0"
+    assert left_out in bench_page(joined).summary
 
 
 @pytest.mark.parametrize(
@@ -146,7 +149,7 @@ def test_what_one_of_them_lacks_is_said(tmp_path: Path) -> None:
     joined = load_merged([here, there], tmp_path)
     assert joined.protocol.seeds == (0, 2)
     assert joined.missing == ("oracle seed 1: 0 of 9 real episodes",)
-    assert "This bench is not finished: shown are 2 of 3 seeds up to 9 of 9 real" in summary_table(joined)
+    assert "This bench is not finished: shown are 2 of 3 seeds up to 9 of 9 real" in bench_page(joined).summary
     assert load_so_far(kept_from(joined.folder, tmp_path / "kept", joined)).missing == joined.missing
 
 
@@ -294,6 +297,6 @@ def test_an_agent_of_fewer_seeds_is_whole_with_these(tmp_path: Path) -> None:
     protocol = dataclasses.replace(small(agents=("table", "random")), seeds=(0, 1, 2), few_seeds=few)
     made = bench(protocol, {}, root=tmp_path / "runs", launcher=Inline())
     assert [(run.agent, run.seed) for run in made.runs if run.agent == "random"] == [("random", 0), ("random", 1)]
-    assert "3 seeds (random 2)" in summary_table(made)
+    assert "3 seeds (random 2)" in bench_page(made).summary
     kept = kept_from(made.folder, tmp_path / "kept")
     assert load_so_far(kept).missing == () and load_so_far(kept).protocol == protocol

@@ -13,7 +13,7 @@ from small_runs import Inline
 
 from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, ImagineBenchError, UnableError
-from imagine_bench.report import bench_page
+from imagine_bench.report.bench import bench_page
 from imagine_bench.running.bench import bench, plan
 from imagine_bench.store import encoders
 

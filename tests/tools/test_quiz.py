@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
@@ -15,6 +16,7 @@ from PIL import Image
 
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError
+from imagine_bench.judge.worlds.families import ShortestPlans
 from imagine_bench.judge.worlds.making import whole_world
 from imagine_bench.rules import states_of_play
 from imagine_bench.tools.quiz import quiz
@@ -102,6 +104,25 @@ def test_a_person_is_asked_until_the_last_question_or_until_leaving(
     (pairs,) = (line.split() for line in whole if line.startswith("single-cause pairs"))
     assert (pairs[2], pairs[4], pairs[6]) == ("1", "6.2", "100.0"), "a pair is right if both are, of four answers each"
     assert quiz(EASY, 1, ask=typed(), judged=tmp_path, folder=tmp_path) == "No question was answered."
+
+
+def test_the_number_beside_the_right_answer_is_right_and_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spec = registry.task(EASY)
+    world = whole_world(spec, states_of_play(spec.rules), 2, frames_vary=True)
+    (plans,) = (family for family in world.families if isinstance(family, ShortestPlans))
+    one = replace(plans, starts=plans.starts[:1], goals=plans.goals[:1], options=plans.options[:1])
+    monkeypatch.setattr("imagine_bench.tools.quiz.whole_world", lambda *_, **__: replace(world, families=(one,)))
+    (right,) = one.options[one.answer(world.truth) == 1.0].tolist()
+    scores = {}
+    for number in range(1, one.options.size + 1):
+        wrong = ["0", str(one.options.size + 1), "", "-1", "1.0"]
+        said = quiz(EASY, 1, ask=typed(*wrong, str(number)), judged=tmp_path, folder=tmp_path)
+        (row,) = (line.split() for line in said.splitlines() if line.startswith("shortest plan"))
+        answers = dict(line.split() for line in capsys.readouterr().out.splitlines() if line.startswith("  "))
+        scores[int(answers[str(number)])] = float(row[3])
+    assert scores == {steps: 100.0 * (steps == right) for steps in one.options[0].tolist()}
 
 
 def test_a_world_too_small_for_questions_is_refused(guests: Guests, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from whole_outputs import Expected, short
 
 from imagine_bench import statistics
 from imagine_bench.protocols.control import Protocol
-from imagine_bench.report import bench_page
+from imagine_bench.report.bench import bench_page
 
 MANY = dataclasses.replace(WIDE, seeds=tuple(range(statistics.FEWEST)))
 ONE = Protocol(task="arrow_puzzle", preset="smoke", seeds=(0,), budgets=(10, 20))

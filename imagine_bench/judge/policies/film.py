@@ -55,12 +55,13 @@ class Film:
 
     def told(self, spec: TaskSpec) -> dict[str, Json]:
         """Its words and numbers: of each step the macro-action, the reward, and whether the episode is over."""
-        return {
+        told: dict[str, Json] = {
             "start": ", ".join(spec.value_names(self.start)),
             "returns": list(self.returns),
-            "believed": [[step.action, step.outcome.reward, step.outcome.over] for step in self.believed],
-            "real": [[step.action, step.outcome.reward, step.outcome.over] for step in self.real],
         }
+        for name, steps in (("believed", self.believed), ("real", self.real)):
+            told[name] = [[step.action, step.outcome.reward, step.outcome.over] for step in steps]
+        return told
 
     def images(self, frame_of: Callable[[State], Frame]) -> Arrays:
         """A frame of the start and of each macrostate that is reached, black where an image showed nothing."""

@@ -28,7 +28,7 @@ from imagine_bench.judge.worlds.tables import (
     with_coupling,
     with_slips,
 )
-from imagine_bench.judge.worlds.words import YES, Named, Words, yes_and_no
+from imagine_bench.judge.worlds.words import YES, Named, Shown, Words, yes_and_no
 
 STREAM = 5  # transitions of a stream
 _OF_STREAM = f"{STREAM} separate macro-actions, each before and after."
@@ -82,52 +82,57 @@ class MaskedFrames:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ShortestPlans:
+class _OfGoals:
+    """Questions about the best plan from a start to a goal."""
+
+    starts: Ints  #: rows of S. Shape (N,).
+    goals: Ints  #: rows of T. Shape (N,).
+
+    def reached(self, table: TransitionTable, depth: int) -> Floats:
+        """The best probability that the goal of each question has come up, by depth. Shape (D, N)."""
+        different, which = np.unique(self.goals, return_inverse=True)
+        return reaching(table, different, depth)[:, self.starts, which]
+
+    def images(self, world: Named, row: int) -> list[Shown]:
+        """The start and the goal of a question."""
+        return [("start", world.states[self.starts[row]]), ("goal", world.states[self.goals[row]])]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShortestPlans(_OfGoals):
     """How many macro-actions does the best plan need until the goal's frame has probably come up?"""
 
     name: ClassVar[str] = "shortest plan"
-    starts: Ints  #: rows of S. Shape (N,).
-    goals: Ints  #: rows of T. Shape (N,).
     options: Ints  #: numbers of macro-actions
 
     def answer(self, table: TransitionTable) -> Floats:
         """The fewest after which the goal has come up with a probability of at least one half."""
-        reached = _reached(table, self.starts, self.goals, int(self.options.max()))
+        reached = self.reached(table, int(self.options.max()))
         return normalised((fewest(reached)[:, None] == self.options).astype(np.float64))
 
     def words(self, world: Named, row: int) -> list[Words]:
         """The number is to be chosen."""
-        images = [("start", world.states[self.starts[row]]), ("goal", world.states[self.goals[row]])]
         text = "How many macro-actions, the best ones, does it take until the goal has probably come up?"
-        return [Words(text, images, list(map(str, self.options[row])))]
+        return [Words(text, self.images(world, row), list(map(str, self.options[row])))]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reachability:
+class Reachability(_OfGoals):
     """Has the goal's frame come up within k macro-actions, the best ones?"""
 
     name: ClassVar[str] = "reachability"
-    starts: Ints  #: rows of S. Shape (N,).
-    goals: Ints  #: rows of T. Shape (N,).
     within: Ints  #: k of each. Shape (N,).
     options: Ints  #: YES and NO
 
     def answer(self, table: TransitionTable) -> Floats:
         """The best policy's probability, and the rest to 1."""
-        reached = _reached(table, self.starts, self.goals, int(self.within.max()))
+        reached = self.reached(table, int(self.within.max()))
         return _yes_or_no(reached[self.within - 1, np.arange(len(self.within))], self.options)
 
     def words(self, world: Named, row: int) -> list[Words]:
         """Yes or no."""
-        images = [("start", world.states[self.starts[row]]), ("goal", world.states[self.goals[row]])]
         text = f"Does the goal come up within {self.within[row]} macro-actions, if they are the best ones?"
-        return [Words(text, images, yes_and_no(self.options[row]))]
-
-
-def _reached(table: TransitionTable, starts: Ints, goals: Ints, depth: int) -> Floats:
-    """The best probability that the goal of each question has come up, by depth. Shape (D, N)."""
-    different, which = np.unique(goals, return_inverse=True)
-    return reaching(table, different, depth)[:, starts, which]
+        return [Words(text, self.images(world, row), yes_and_no(self.options[row]))]
 
 
 def _yes_or_no(yes: Floats, options: Ints) -> Floats:

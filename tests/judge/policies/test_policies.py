@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import itertools
 import math
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -185,6 +186,19 @@ def test_exploits_lie_between_those_of_every_plan_and_the_bound(states: int, act
         for values, each in ((found.believed, model), (found.real, truth)):
             again = [by_recursion(each, found.plan, state, horizon) for state in range(states)]
             assert values == pytest.approx(again)
+
+
+def test_the_search_for_exploits_begins_with_the_given_policies() -> None:
+    """The overrated way costs one at first; no decision alone leads to it from drawn plans or the model's best one."""
+    onward = np.zeros((2, 3, 2))
+    onward[0, 1, 1] = 1.0
+    model = DenseModel(onward, np.array([[0.0, -1.0, 10.0], [0.0, 5.0, 6.0]]))
+    truth = DenseModel(onward, np.array([[0.0, 0.0, 10.0], [0.0, 0.0, 6.0]]))
+    starts = np.array([1.0, 0.0])
+    luckless = mock.Mock(integers=lambda high, size: np.zeros(size, dtype=np.int64))
+    for policy, overrating in (([1, 1], 4.0), ([0, 0], 0.0)):
+        found = largest_exploit(model, truth, starts, np.eye(3)[policy][None], 2, luckless)
+        assert starts @ (found.believed - found.real) == pytest.approx(overrating)
 
 
 @pytest.mark.parametrize(("reached", "over", "steps"), [((1,), False, 3), ((1,), True, 1), ((7,), False, 1)])

@@ -162,6 +162,23 @@ def test_what_has_no_label_teaches_nothing_and_is_not_asked_again(curious: Facto
     assert np.array_equal(curious.q_values(SEEN), values)
 
 
+def test_of_equally_uncertain_questions_the_shortest_is_asked(experienced: FactoredAgent) -> None:
+    learner = copy.deepcopy(experienced)
+    learner.learn()
+    fewest: dict[tuple[int, ...], int] = {}
+    for length in (1, 2):
+        for actions in itertools.product(range(ACTIONS), repeat=length):
+            here = CODE
+            for action in actions:
+                here, *_ = fake_codes.step(here, action)
+            fewest.setdefault(here, length)
+    for goal, length in fewest.items():  # whatever leads to the goal is as uncertain as anything else that does
+        learner.model.untested = lambda codes, following, goal=goal: 0.9 * (following == goal).all(axis=2)
+        actions = learner.query(SEEN)
+        assert actions is not None and len(actions) == length
+    assert sorted(fewest.values()) == [1] * ACTIONS + [2] * 5
+
+
 def test_queries_lead_where_the_dynamics_do(experienced: FactoredAgent) -> None:
     learner = copy.deepcopy(experienced)
     learner.learn()

@@ -16,6 +16,7 @@ import torch
 from imagine_bench.tasks.motion.arm_model import ArmModel
 from imagine_bench.tasks.scenes.constants import OBSERVATION_QPOS_RAD, TABLE_HEIGHT_M
 from imagine_bench_motion import trials
+from imagine_bench_motion.cloned_env import BUNDLED
 from imagine_bench_motion.cloning import Clone, Standardisation, Training, _varied, train
 from imagine_bench_motion.demonstrations import DemonstrationData, collect, turn_of
 from imagine_bench_motion.instruction import GO_BACK, words_vector
@@ -80,6 +81,7 @@ def test_demonstrations_depend_on_the_seed_and_come_back(tmp_path: Path) -> None
     data.save(tmp_path / "some")
     kept = DemonstrationData.load(tmp_path / "some")
     assert kept.observation == kept.first(2).observation == VECTORS
+    assert kept.world == kept.first(2).world == "arrow_puzzle"
     with pytest.raises(InvalidValueError, match="The demonstrations show proprio,objects, not front,proprio; give"):
         train(kept, seed=0, observation="front,proprio", settings=Training(updates=1))
     with pytest.raises(InvalidValueError, match="chunk is 0; give an integer from 1 on"):
@@ -267,6 +269,7 @@ def test_a_saved_clone_acts_as_before(tmp_path: Path) -> None:
     for each in (clone(), again):
         each.begin("turn the left cube clockwise")
     np.testing.assert_array_equal(clone().act(seen), again.act(seen))
+    assert again.world == "arrow_puzzle" and Clone.load(BUNDLED).world == "", "the bundled file is older"
     (tmp_path / "other.pt").write_bytes(b"no clone")
     with pytest.raises(ArtefactError, match="train one first"):
         Clone.load(tmp_path / "other.pt")
@@ -275,8 +278,15 @@ def test_a_saved_clone_acts_as_before(tmp_path: Path) -> None:
 def test_a_scene_with_other_objects_is_refused_by_a_clone() -> None:
     clone().begin("turn the left cube clockwise")
     seen = {"proprio": np.zeros(16, dtype=np.float32), "objects": np.zeros((2, 7), dtype=np.float32)}
-    with pytest.raises(InvalidValueError, match="learned from 37 numbers beside images, and this scene gives 30"):
+    with pytest.raises(InvalidValueError, match=r"learned from 37 numbers .* gives 30.*those of arrow_puzzle\."):
         clone().act(seen)
+
+
+@pytest.mark.parametrize(
+    ("options", "name"), [({"cubes": 1}, "arrows:cubes=1,horizon=10"), ({"family": "pick_place"}, "pick_place")]
+)
+def test_demonstrations_say_their_family_and_number_of_cubes(options: dict[str, Any], name: str) -> None:
+    assert collect(1, seed=5, observation=VECTORS, **options).world == name
 
 
 @pytest.mark.slow

@@ -94,6 +94,11 @@ class Clone:
         self._due: list[NDArray[np.float32]] = []
 
     @property
+    def world(self) -> str:
+        """The task of its demonstrations by its name; empty of an old file."""
+        return str(self.about.get("world", ""))
+
+    @property
     def observation(self) -> str:
         """The parts that it sees, as an environment takes them."""
         return str(self.about["observation"])
@@ -119,7 +124,8 @@ class Clone:
         if seen.shape != self._inputs.mean.shape:
             raise InvalidValueError(
                 f"The clone learned from {len(self._inputs.mean)} numbers beside images, and this scene gives "
-                f"{len(seen)}; give one with the objects of its demonstrations."
+                f"{len(seen)}; give one with the objects of its demonstrations"
+                f"{f', those of {self.world}' if self.world else ''}."
             )
         with torch.inference_mode():
             images = {camera: _as_input(image[None]) for camera, image in images_of(observation).items()}
@@ -208,6 +214,7 @@ def train(
     began_s = time.process_time()
     _fit(network, data, inputs, commands, settings, generator, told)
     about = {
+        "world": data.world,
         "observation": observation,
         "size_px": size_px,
         "demonstrations": data.count,

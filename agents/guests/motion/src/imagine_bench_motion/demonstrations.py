@@ -43,6 +43,7 @@ class DemonstrationData:
     hand_m: NDArray[np.float32]  #: where the hand is by these commands, in the world: (T, 3)
     episode: NDArray[np.int64]  #: which demonstration: (T,)
     observation: str = ""  #: the parts that are shown, as the environment takes them; empty of an old file
+    world: str = ""  #: the task by its name, such as ``"arrows:cubes=2,horizon=10"``; empty of an old file
 
     @property
     def count(self) -> int:
@@ -61,6 +62,7 @@ class DemonstrationData:
             hand_m=self.hand_m[kept],
             episode=self.episode[kept],
             observation=self.observation,
+            world=self.world,
         )
 
     def chunks(self, length: int) -> NDArray[np.int64]:
@@ -89,7 +91,7 @@ class DemonstrationData:
         arrays: dict[str, Any] = {f"image.{camera}": image for camera, image in self.images.items()}
         named = {name: getattr(self, name) for name in _NAMES}
         with writing(path), path.open("wb") as stream:
-            np.savez(stream, **arrays, **named, observation=np.array(self.observation))
+            np.savez(stream, **arrays, **named, observation=np.array(self.observation), world=np.array(self.world))
 
     @classmethod
     def load(cls, path: Path) -> DemonstrationData:
@@ -99,7 +101,8 @@ class DemonstrationData:
             found = read_arrays(path, what)
             images = {name.removeprefix("image."): each for name, each in found.items() if name.startswith("image.")}
             named = {name: found[name] for name in _NAMES}
-            return cls(images=images, **named, observation=str(found.get("observation", "")))
+            observation = str(found.get("observation", ""))
+            return cls(images=images, **named, observation=observation, world=str(found.get("world", "")))
 
 
 def collect(
@@ -148,6 +151,7 @@ def collect(
         hand_m=np.stack([row for each in kept for row in each.hand_m]),
         episode=np.repeat(np.arange(len(kept)), [len(each.commands) for each in kept]),
         observation=observation,
+        world=stages[0].env.task.id,
     )
 
 
