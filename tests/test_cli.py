@@ -61,11 +61,13 @@ def test_a_former_command_runs_the_new_one(
 
 
 @pytest.mark.parametrize("words", ["--seeds 0-2 7 --out 2026-11", "--seeds=0-2 --out=2026-11"])
-def test_a_range_stands_for_its_seeds_and_for_nothing_else(words: str) -> None:
-    command = cli.parsed(["bench", "arrow_puzzle", *words.split()])
+@pytest.mark.parametrize("home", ["", "~/"])
+def test_a_range_stands_for_its_seeds_and_for_nothing_else(words: str, home: str) -> None:
+    """And a home folder for its path."""
+    command = cli.parsed(["bench", "arrow_puzzle", *words.replace("2026", f"{home}2026").split()])
     assert isinstance(command, cli.Bench)
     assert command.budget.seeds is not None and command.budget.seeds[:3] == (0, 1, 2)
-    assert command.launch.out == Path("2026-11")
+    assert command.launch.out == Path(Path.home() if home else "") / "2026-11"
 
 
 def test_a_command_called_from_python_leaves_the_process_as_it_was(
@@ -301,12 +303,6 @@ def test_a_word_nobody_means_is_one_line(words: list[str], sentence: str, capsys
     said = capsys.readouterr().err
     assert len(said.splitlines()) == 1 and "\x1b" not in said
     assert sentence in said or "name is too long" in said
-
-
-@pytest.mark.parametrize("words", [["--out", "~/x"], ["--out=~/x"]])
-def test_the_home_folder_is_expanded(words: list[str]) -> None:
-    command = cli.parsed(["report", *words])
-    assert isinstance(command, cli.Report) and command.out == Path.home() / "x"
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has a disk that is always full")

@@ -301,6 +301,10 @@ def test_so_many_more_runs_would_show_a_difference_in_four_of_five() -> None:
     enough = int(np.median(counts))
     a, b = rng.normal([[0.6], [0.4]], 0.15, (500, 2, enough)).swapaxes(0, 1)
     assert 0.7 < np.mean(statistics.differences(a, b)[3] < 0.025) < 0.97
+    now = math.sqrt(sum(p * (1.0 - p) / tests for p, tests in ((552 / 1004, 1000), (702 / 1404, 1400))))  # of 200 tests
+    least = (sum(stats.t.ppf([0.9875, 0.8], count - 1)) * now * math.sqrt(5 / count) for count in range(6, 99))
+    needed = next(more for more, size in enumerate(least, 1) if size <= 0.05)
+    assert statistics.more_seeds([0.55] * 5, [0.5] * 7, cells=2, trials=200) == needed == 6
     assert statistics.more_seeds([0.5], [0.7], cells=2) == 0, "a single run has no spread"
     assert statistics.more_seeds([0.5, 0.6], [0.6, 0.5], cells=2) == 0, "no number of runs shows that nothing differs"
     assert statistics.more_seeds([0.9, 0.91, 0.92], [0.1, 0.11, 0.12], cells=2) == 2, (

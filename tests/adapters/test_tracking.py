@@ -153,6 +153,7 @@ def histories(out):
         records = [Record.FromString(content) for content in _records(path)]
         assert [each.exit.exit_code for each in records if each.HasField("exit")] == [0]
         (run,) = (each.run for each in records if each.HasField("run"))
+        assert run.run_group == run.display_name.partition("/")[0], "seeds of an agent stand together"
         found[run.display_name] = [
             {item.key or "/".join(item.nested_key): json.loads(item.value_json) for item in each.history.item}
             for each in records

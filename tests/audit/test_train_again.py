@@ -6,9 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import shutil
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Sequence
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -18,14 +16,21 @@ import numpy as np
 import pytest
 from forger import forged, share_weights
 from forging import OpenRun, mixed, rewrite_protocol
-from small_runs import QUICK, Inline, small, written
+from small_runs import QUICK, Inline, made_bench, small, written
 
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import IncompleteCheckError, InvalidValueError
 from imagine_bench.running.bench import bench, plan
 from imagine_bench.running.control import plan_control
-from imagine_bench.running.player import played_run, protocol_of_player
-from imagine_bench.running.retraining import Retraining, Verdict, chance_to_find, drawn, train_again
+from imagine_bench.running.retraining import (
+    SAME_EPISODES,
+    Retraining,
+    Verdict,
+    chance_to_find,
+    drawn,
+    train_again,
+)
+from imagine_bench.seeding import TUNING_SEEDS
 from imagine_bench.store.files import read_sealed, sealed
 from imagine_bench.tools.audits import conclusion, verify, what_is_shown
 
@@ -96,11 +101,13 @@ def test_an_honest_run_repeats_to_the_bit(pair: Path) -> None:
 
 def test_the_chance_to_find_a_forgery_counts_an_agents_runs(tmp_path: Path) -> None:
     wanted = dataclasses.replace(small(agents=("table", "random")), seeds=(0, 1, 2, 3), few_seeds=(("random", 0),))
-    folder = bench(wanted, {}, root=tmp_path, launcher=Inline()).folder
+    folder = made_bench(wanted, tmp_path).folder
     said = what_is_shown(folder, [Verdict(what="one", of_training=True)], again("a")).splitlines()
     assert "Trained again: 1 runs, 1 of an agent's 1 or 1 of an agent's 4, drawn by --nonce a." in said
+    assert str(Verdict(what="one", episodes=1200)) == "one: holds; 1,200 episodes played again"
     assert said[-2] == "Chance that a draw finds a forged run of an agent: 1 of 1 forged: 100.0 %."
-    assert said[-1].startswith("Chance that a draw finds a forged run of an agent: 1 of 4 forged: 25.0 %; 2 of 4")
+    chances = said[-1].partition(" of an agent: ")[2]
+    assert chances == "1 of 4 forged: 25.0 %; 2 of 4 forged: 50.0 %; 4 of 4 forged: 100.0 %."
 
 
 def test_a_dataset_from_which_no_run_learned_is_refused(pair: Path, tmp_path: Path) -> None:
@@ -110,11 +117,12 @@ def test_a_dataset_from_which_no_run_learned_is_refused(pair: Path, tmp_path: Pa
 
 
 def test_runs_of_a_dataset_that_is_not_given_are_not_compared(tmp_path: Path) -> None:
-    few: dict[str, Any] = {"agents": ("table",), "appearance": "mild", "evaluation_episodes": 2, **QUICK}
+    few: dict[str, Any] = {"agents": ("table", "random"), "appearance": "mild", "evaluation_episodes": 2, **QUICK}
     given = written(tmp_path / "set").folder
     folder = bench(*plan("arrow_puzzle", "smoke", dataset=given, **few), root=tmp_path, launcher=Inline()).folder
-    *_, last = found = verify(folder, again())
+    *_, last, blind = found = verify(folder, again())
     assert not last.complaint and "it learned from the dataset" in last.unshown[0]
+    assert "random" in blind.what and "repeats to the bit" in str(blind), "it learned nothing"
     assert isinstance(conclusion(found), IncompleteCheckError)
     assert "repeats to the bit" in str(verify(folder, dataclasses.replace(again(), dataset=given))[-1])
     other = dataclasses.replace(again(), dataset=written(tmp_path / "other", seed=9).folder)
@@ -124,7 +132,7 @@ def test_runs_of_a_dataset_that_is_not_given_are_not_compared(tmp_path: Path) ->
 
 def through_encoder(pair: Path, root: Path, used: str) -> Path:
     """A bench whose one learner is said to have seen through an encoder."""
-    whole = forged(pair, root, lambda folder: None)
+    whole = forged(pair, root)
     return rewrite_protocol(whole, agents=["dqn"], seeds=[0], encoder=used)
 
 
@@ -151,20 +159,10 @@ def test_an_absent_agent_is_not_compared_and_one_that_fails_a_complaint(pair: Pa
         ("person", "it cannot be: person alone is no name", ""),
         ("failing", "it cannot be: this agent breaks on purpose", ""),
     ):
-        whole = forged(pair, tmp_path / agent, lambda folder: None)
+        whole = forged(pair, tmp_path / agent)
         (found,) = train_again(rewrite_protocol(whole, agents=[agent], seeds=[1]), again())
         assert found.complaint.startswith(complaint) and bool(found.complaint) == bool(complaint)
         assert unshown in "".join(found.unshown)
-
-
-def test_a_persons_run_is_not_trained_again(tmp_path: Path) -> None:
-    played = protocol_of_player("arrow_puzzle", "person", "anna", tests=1, execution="kinematic")
-    with played_run(played, tmp_path) as run:
-        while not run.is_done:
-            run.reset()
-            run.step(0)
-    *_, last = verify(run.folder.parents[1], again())
-    assert not last.complaint and "cannot be trained here" in last.unshown[0]
 
 
 def test_runs_that_do_not_hold_are_not_said_to_be_trained_again(
@@ -220,6 +218,19 @@ def test_an_episode_after_a_dataset_is_named_by_its_number_in_training(tmp_path:
     assert found.complaint.startswith("training episode 7 took other macro-actions")
 
 
+def test_a_rounding_of_another_processor_may_decide_late_and_not_early(tmp_path: Path) -> None:
+    honest = made_bench(small(budgets=(12,)), tmp_path).folder
+    for episode, complaint in ((SAME_EPISODES - 1, "training episode 9 took other macro-actions"), (SAME_EPISODES, "")):
+        elsewhere(folder := forged(honest, tmp_path / str(episode)))
+        run = OpenRun.read(folder / "table" / "seed_0")
+        first = run.arrays["training/lengths"][:episode].sum()
+        run.arrays["training/actions"][first] = (run.arrays["training/actions"][first] + 1) % 6
+        run.write()
+        (found,) = train_again(folder, again())
+        assert found.complaint.startswith(complaint) and bool(found.complaint) == bool(complaint)
+    assert found.holds == "its first 10 training episodes repeat" and found.unshown[0].startswith("bits, for its cpu")
+
+
 def test_what_a_replay_cannot_show_training_again_does(pair: Path, tmp_path: Path) -> None:
     """On another processor too where training repeats there; another commit is no reason for other costs."""
     another = sessions(lambda found: found["environment"].update(commit="f" * 40))
@@ -232,6 +243,7 @@ def test_what_a_replay_cannot_show_training_again_does(pair: Path, tmp_path: Pat
         ("CPU s of tests were kept", invented("eval_cpu_s")),
     )):  # fmt: skip
         assert found in trained(pair, tmp_path / str(number), *forge)
+    assert not trained(pair, tmp_path / "one", elsewhere, by_oracle(1)), "1 of 8 tests may go otherwise there"
 
 
 def test_cpu_seconds_that_are_far_too_small_are_found(
@@ -263,6 +275,8 @@ def test_what_was_made_on_another_processor_holds_in_part(pair: Path, tmp_path: 
     error = conclusion(found)
     assert error is not None and error.exit_code == 3 and "repeats to the bit" in str(found[-1])
     assert str(error).endswith("Not compared: CPU seconds, for its cpu is said to have been another.")
+    there = rewrite_protocol(forged(pair, tmp_path / "device"), device="cuda")
+    assert "for its device is said to have been another" in str(train_again(there, again())[0])
 
 
 def commanded(seeds: str) -> Forge:
@@ -294,13 +308,22 @@ def test_the_first_line_and_the_exit_code_say_what_was_found(
     assert bool(said.err) == bool(code)
 
 
-@pytest.mark.parametrize(("left", "preset"), [(0, "quick"), (1, "smoke")])
+@pytest.mark.parametrize(
+    ("preset", "seeds", "few", "said"),
+    [
+        ("quick", range(6), 0, ""),  # as many as the preset has, of random one
+        ("quick", range(TUNING_SEEDS, TUNING_SEEDS + 6), TUNING_SEEDS, ""),
+        ("quick", range(6), 1, "it has (0, 1, 2, 3, 4, 5), fewer of random; its preset quick (0, 1, 2, 3, 4, 5)"),
+        ("quick", range(5), 0, "it has (0, 1, 2, 3, 4), fewer of random; its preset quick (0, 1, 2, 3, 4, 5)"),
+        ("smoke", [1], 1, "it has (1,); its preset smoke (0,)"),
+    ],
+)
 def test_seeds_that_may_have_been_left_out_are_said(
-    pair: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], left: int, preset: str
+    tmp_path: Path, preset: str, seeds: Sequence[int], few: int, said: str
 ) -> None:
-    """Seed 1 of 0 and 1 alone; and seed 0 alone of a preset of three seeds."""
-    folder = forged(
-        pair, tmp_path, partial(lambda name, folder: shutil.rmtree(folder / name), f"table/seed_{1 - left}")
-    )
-    assert main(["verify", str(rewrite_protocol(folder, seeds=[left], preset=preset))]) == 3
-    assert "Not compared: whether seeds were left out: it has " in capsys.readouterr().out.splitlines()[0]
+    fewer = (("random", few),) if len(seeds) > 1 else ()
+    wanted = small(agents=("table", "random"), budgets=(1,), evaluation_episodes=1)
+    wanted = dataclasses.replace(wanted, preset=preset, seeds=tuple(seeds), few_seeds=fewer)
+    *_, found = verify(made_bench(wanted, tmp_path).folder)
+    claims = [claim.partition("whether seeds were left out: ")[2] for claim in found.unshown]
+    assert [*filter(None, claims)] == [said] * bool(said) and not found.complaint

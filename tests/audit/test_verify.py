@@ -15,7 +15,7 @@ from forger import FORGERIES, IN_TRAINING, forged, share_weights
 from forging import OpenRun, of_second, oracle, rewrite_protocol
 from guest_packages import Guests
 from kinds import take_row
-from small_runs import Inline, collected, small
+from small_runs import Inline, collected, made_bench, small
 
 from imagine_bench import registry
 from imagine_bench.data.folder import write_dataset
@@ -25,6 +25,7 @@ from imagine_bench.judge.verify import Replays, has_own_failures, verdicts
 from imagine_bench.protocols.control import protocol
 from imagine_bench.report.bench import bench_page
 from imagine_bench.report.page import texts
+from imagine_bench.rules import fewest_actions
 from imagine_bench.running.bench import bench, load_bench
 from imagine_bench.running.control import plan_control
 from imagine_bench.running.evaluation import EvaluationCounts, play_test_episode, replay
@@ -39,7 +40,7 @@ from imagine_bench.tools.audits import verify, what_is_shown, with_report
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bench of a learner and of one that is none, with its report."""
     wanted = small(agents=("table", "random"), evaluation_episodes=8)
-    result = bench(wanted, {}, root=tmp_path_factory.mktemp("bench"), launcher=Inline())
+    result = made_bench(wanted, tmp_path_factory.mktemp("bench"))
     (result.folder / "report").mkdir()
     for name, text in texts(bench_page(result), images=False).items():  # type: ignore[arg-type]
         (result.folder / "report" / name).write_text(text)
@@ -141,7 +142,7 @@ def test_a_forged_figure_is_named_where_there_is_no_report_too(
 
 def test_a_report_follows_from_the_runs(finished: Path, tmp_path: Path) -> None:
     """Each part that is missing, cut short or of other words; one that cannot be made; in time that grows with it."""
-    folder = forged(finished, tmp_path, lambda folder: None)
+    folder = forged(finished, tmp_path)
     assert [each.complaint for each in with_report(folder, [])] == [""]
 
     def complaint(name: str, text: str | None) -> str:
@@ -186,6 +187,15 @@ def test_a_report_of_another_version_is_not_compared(finished: Path, tmp_path: P
 @pytest.mark.parametrize(
     ("task", "changes"),
     [
+        (
+            "arrow_puzzle",
+            {
+                "agents": ("table",),
+                "unannounced": True,
+                "after_episodes": 2,
+                "after": ("arrow_puzzle_hard", "arrow_puzzle_toward"),
+            },
+        ),
         ("arrow_puzzle", {"observation": "frame,proprio", "observation_size": 96}),
         ("arrow_puzzle", {"test_appearance": "mild"}),
         ("arrows:cubes=2,gesture=0.5,lag=1,slip=0.2,horizon=3", {}),
@@ -196,9 +206,12 @@ def test_a_report_of_another_version_is_not_compared(finished: Path, tmp_path: P
 )
 def test_benches_of_every_kind_hold(task: str, changes: dict[str, Any], tmp_path: Path) -> None:
     few = {"agents": ("random",), "evaluation_episodes": 4, "execution": "kinematic", "recorded_episodes": 0, **changes}
-    run, *others = verify(bench(protocol(task, "smoke", **few), {}, root=tmp_path, launcher=Inline()).folder)
+    run, *others = verify(made_bench(protocol(task, "smoke", **few), tmp_path).folder)
     (agent,) = few["agents"]
     assert str(run).startswith(f"{agent} seed 0: holds; {8 if agent == 'random' else 28} episodes")
+    assert [each for each in run.unshown if " before" in each] == [
+        f"its training on {', '.join(few['after'])} before" for _ in few.get("after", ())[:1]
+    ]
     assert not any(each.complaint for each in others)
 
 
@@ -234,12 +247,13 @@ def test_claims_of_training_follow_from_its_macro_actions(pair: Path, tmp_path: 
         ({"execution": "physics"}, "the simulated time in seconds is"),
         ({"settings_digest": "0123456789ab"}, "and the file says '0123456789ab'"),
         ({"encoder": "other@0123456789ab"}, "it names the encoder other@0123456789ab, and no agent reads latents"),
+        ({"codes": "other@0123456789ab"}, "it names the encoder other@0123456789ab, and no agent reads codes"),
     ],
 )
 def test_what_a_protocol_says_follows_from_its_runs(
     pair: Path, tmp_path: Path, claim: dict[str, str], complaint: str
 ) -> None:
-    folder = rewrite_protocol(forged(pair, tmp_path, lambda folder: None), **claim)
+    folder = rewrite_protocol(forged(pair, tmp_path), **claim)
     assert complaint in " ".join(each.complaint for each in verify(folder))
 
 
@@ -256,7 +270,7 @@ class Lasting(Wrapper):
 @pytest.mark.parametrize("group", ["training", "rows/0/kept"])
 def test_simulated_times_may_differ_by_a_share(pair: Path, tmp_path: Path, group: str) -> None:
     """By that by which kinds of CPU differ, 5 %, however long episodes are; what takes no time takes none."""
-    folder = forged(pair, tmp_path, lambda folder: None)
+    folder = forged(pair, tmp_path)
     shutil.rmtree(folder / "table" / "seed_0")
     run = OpenRun.read(folder / "table" / "seed_1")
     times = [name for name in run.arrays if name.endswith("/sim_times_s")]
@@ -278,34 +292,44 @@ def test_simulated_times_may_differ_by_a_share(pair: Path, tmp_path: Path, group
             assert ("simulated time" in found.complaint) != holds and bool(found.complaint) != holds, (each_s, factor)
 
 
-def test_failures_are_a_seeds_own_unless_chance_decides() -> None:
-    slips = protocol("arrows:slip=0.3", "smoke", agents=("random",))
-    for own, task, failed in (
-        (True, small(), [[0, 1, 2]]),
-        (True, small(), [[0, 1], [2]]),  # together
-        (False, small(), [[0, 1, 0]]),
-        (False, slips, [[0, 1, 2]]),
-    ):
-        played = [[0], *failed]
-        none = [0] * len(played)
-        start = list(task.spec(testing=True).rules.start_states[0])
-        counts = EvaluationCounts(
-            starts=[start] * len(played), lengths=[*map(len, played)], returns=none, faults=none, fingerprints=none,
-            actions=np.concatenate(played).tolist(), solved="1" + "0" * len(failed),
-        )  # fmt: skip
-        assert has_own_failures(counts.kept(), task) == own
+@pytest.mark.parametrize(
+    ("own", "task", "failed", "solved"),
+    [
+        (True, "arrows", [[0, 1, 2]], "1"),
+        (True, "arrows", [[0, 1], [2]], "1"),  # together
+        (False, "arrows", [[0, 1, 0]], "1"),
+        (False, "arrows", [[0, 1, 2]], "0"),  # nothing is solved
+        (False, "arrows:slip=0.3", [[0, 1, 2]], "1"),
+        (False, "arrows:gesture=first", [[0, 1, 2]], "1"),
+        (False, "arrows:lag=1", [[0, 1, 2]], "1"),
+        (False, "arrows:horizon=1", [[0, 1, 2]], "1"),  # no plan is short enough
+    ],
+)
+def test_failures_are_a_seeds_own_unless_equal_plans_fail_alike(
+    own: bool, task: str, failed: list[list[int]], solved: str
+) -> None:
+    wanted = protocol(task, "smoke", agents=("random",))
+    played = [[0], *failed]
+    none = [0] * len(played)
+    rules = registry.task("arrows").rules
+    start = next(list(each) for each in rules.start_states if fewest_actions(rules, each) > 1)
+    counts = EvaluationCounts(
+        starts=[start] * len(played), lengths=[*map(len, played)], returns=none, faults=none, fingerprints=none,
+        actions=np.concatenate(played).tolist(), solved=solved + "0" * len(failed),
+    )  # fmt: skip
+    assert has_own_failures(counts.kept(), wanted) == own
 
 
 def test_an_earlier_run_holds_and_names_its_missing_facts(tmp_path: Path) -> None:
     older = Path(__file__).parents[1] / "store" / "of_abcb05c" / "whole"
-    run, *_ = verify(forged(older, tmp_path, lambda folder: None))
+    run, *_ = verify(forged(older, tmp_path))
     assert str(run).startswith("table seed 0: holds; 10 episodes")
     assert "env_steps, budgets and successes in training are claims" in str(run)
 
 
 def test_a_changed_sealed_file_is_a_complaint_in_one_line(pair: Path, replays: Replays, tmp_path: Path) -> None:
     """Texts, numbers of 4,000 digits, and parts that are missing: none of them ends in a raw error."""
-    folder = forged(pair, tmp_path, lambda folder: None)
+    folder = forged(pair, tmp_path)
     run = OpenRun.read(folder / "table" / "seed_1")
     row = run.rows[0]
     spots = [(row, name) for name in row if name not in ("beliefs", "open_loop", "diagnostics")]
@@ -344,6 +368,7 @@ def test_two_seeds_may_learn_the_same_from_a_dataset_alone(tmp_path: Path, episo
     assert has_own_failures(counts.kept(), wanted)
     one, second, *_ = verify(folder)
     assert one.episodes == episodes - 6 + 4
+    assert one.unshown == (f"the training episodes that are those of the dataset {wanted.dataset}",)
     assert not one.complaint and complaint in second.complaint and bool(complaint) == bool(second.complaint)
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_runs import Inline, small
+from small_runs import made_bench, small
 from whole_outputs import Expected, masked
 
 from imagine_bench import registry
@@ -19,7 +19,6 @@ from imagine_bench.judge.causes import CAUSES, FORMER_CAUSES, beliefs, frames_to
 from imagine_bench.report.page import Page, texts
 from imagine_bench.report.sections import causes_table, read_causes
 from imagine_bench.rules import states_of
-from imagine_bench.running.bench import bench
 from imagine_bench.running.trained import load_trained
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
@@ -48,7 +47,7 @@ def test_the_causes_of_a_bench_are_in_its_table_and_on_its_page(
 ) -> None:
     monkeypatch.setattr(audits, "write_page", write_texts)
     wanted = small(agents=("table", "random"), seeds=(0, 1), evaluation_episodes=12)
-    folder = bench(wanted, {}, root=tmp_path, launcher=Inline()).folder
+    folder = made_bench(wanted, tmp_path).folder
     said = explained(folder)
     text = (folder / "why" / "causes.csv").read_text()
     expected("why", masked(f"{said}\n{text}", tmp_path))
@@ -70,7 +69,7 @@ def test_experience_at_a_budget_is_that_of_the_episodes_before_it(
     monkeypatch.setattr(causes, "Attribution", attribution)
     causes.causes_of(load_trained(pair / "table" / "seed_0"))
     first = small(agents=("table",), seeds=(0,), budgets=(4,), evaluation_episodes=8)
-    ended = bench(first, {}, root=tmp_path, launcher=Inline()).folder
+    ended = made_bench(first, tmp_path).folder
     tried = load_run(ended / "table" / "seed_0").tried
     assert tried is not None
     assert given[0] == tried[:, :-1].tolist()
@@ -86,7 +85,7 @@ def test_tests_in_which_nothing_failed_are_counted_too(tmp_path: Path, monkeypat
     found = [causes.Tested(episodes=4, tests=7, causes=some), causes.Tested(episodes=9, tests=7, causes={})]
     monkeypatch.setattr(audits, "write_page", lambda folder, page: None)
     monkeypatch.setattr(audits, "causes_of", lambda trained: found)
-    folder = bench(small(evaluation_episodes=1), {}, root=tmp_path, launcher=Inline()).folder
+    folder = made_bench(small(evaluation_episodes=1), tmp_path).folder
     explained(folder)
     assert [line[1:3] for line in read_causes(folder).rows] == [["4", "2 of 7"], ["9", "0 of 7"]]
     monkeypatch.undo()

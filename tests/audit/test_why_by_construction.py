@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 import pytest
 from flawed_agents import HalfBlind, Sound
-from small_runs import Inline, small
+from small_runs import made_bench, small
 
 from imagine_bench import registry
 from imagine_bench.cli import observers
@@ -20,7 +20,8 @@ from imagine_bench.interfaces import AgentContext, Rules, State
 from imagine_bench.judge import causes as why
 from imagine_bench.protocols.control import protocol
 from imagine_bench.rules import states_of
-from imagine_bench.running.bench import bench, load_bench
+from imagine_bench.running.bench import load_bench
+from imagine_bench.running.player import played_run, protocol_of_player
 from imagine_bench.running.trained import load_trained
 from imagine_bench.seeding import SeedTree, episode_seed
 from imagine_bench.store.results import Checkpoint, RunResult
@@ -32,7 +33,7 @@ def finished(root: Path, agent: str, task: str, **changes: Any) -> RunResult:
     """The run of a bench of one agent."""
     few: dict[str, Any] = {"agents": (agent,), "budgets": (80,), "evaluation_episodes": 24, **changes}
     Sound.task = task
-    return load_bench(bench(small(task, **few), {}, root=root, launcher=Inline()).folder).runs[0]
+    return load_bench(made_bench(small(task, **few), root).folder).runs[0]
 
 
 def asked(root: Path, agent: str, task: str, **changes: Any) -> tuple[Checkpoint, why.Tested]:
@@ -48,7 +49,7 @@ def asked(root: Path, agent: str, task: str, **changes: Any) -> tuple[Checkpoint
 @pytest.mark.parametrize(
     ("agent", "cause", "task"),
     [
-        ("blind", "misread", CUBES),
+        ("half_blind", "misread", CUBES),
         ("bad", "values", CUBES),
         ("not_greedy", "planning", CUBES),
         ("wrong_model", "model", CUBES),
@@ -60,8 +61,10 @@ def asked(root: Path, agent: str, task: str, **changes: Any) -> tuple[Checkpoint
     ],
 )
 def test_one_flaw_is_the_cause_of_every_failure(agent: str, cause: str, task: str, tmp_path: Path) -> None:
-    _, found = asked(tmp_path, agent, task)
-    assert set(found.causes.values()) == {cause} and len(found.causes) > 12
+    """Also of seeds for tuning, whose tests begin elsewhere."""
+    for seed in (0, 1000) if agent == "half_blind" else (0,):
+        _, found = asked(tmp_path / str(seed), agent, task, seeds=(seed,))
+        assert set(found.causes.values()) == {cause} and len(found.causes) > 12
 
 
 def test_grasps_that_slip_are_the_cause_of_every_failure(tmp_path: Path) -> None:
@@ -180,3 +183,14 @@ def test_unlucky_is_what_an_optimal_policy_fails_with_the_same_draws(task: str, 
             missed |= set() if info["is_success"] else {test}
     assert {test for test in whole if found.causes[test] == "unlucky"} == missed
     assert 3 < len(missed) < len(whole) - 5
+
+
+def test_a_persons_failures_are_bad_luck_or_decisions(tmp_path: Path) -> None:
+    wanted = protocol_of_player("arrows:cubes=2,slip=0.7", "person", "anna", tests=30, execution="kinematic")
+    with played_run(wanted, tmp_path) as run:
+        while not run.is_done:
+            run.reset()
+            while not any(run.step(0)[2:4]):
+                pass
+    *_, tested = why.causes_of_player(run.folder)
+    assert {*tested.causes.values()} == {"unlucky", "decision"}

@@ -91,6 +91,24 @@ def test_a_package_that_ends_python_costs_itself_alone(
     assert main(["bench", "arrow_puzzle", "--agents", "ending"]) == 2
 
 
+@pytest.mark.parametrize(
+    ("words", "then"),
+    [
+        ("bench arrow_puzzle --agents stopping", "goes on from the last checkpoints"),
+        ("judge arrow_puzzle --models stopping", "goes on from the last checkpoints"),
+        ("sweep --agents stopping", "goes on from the last checkpoints"),
+        ("list", "begins anew"),
+    ],
+)
+def test_an_interrupted_command_says_how_it_goes_on(
+    guests: Guests, capsys: pytest.CaptureFixture[str], words: str, then: str
+) -> None:
+    offers = {f"imagine_bench.{group}": {"stopping": "stopping:ENTRY"} for group in ("agents", "world_models")}
+    guests.write("stopping", "raise KeyboardInterrupt", offers)
+    assert main(words.split()) == 130
+    assert capsys.readouterr().err == f"imagine-bench: interrupted; the same command {then}.\n"
+
+
 _RED = "\x1b[31m"
 
 

@@ -134,6 +134,8 @@ def test_a_default_leaves_out_absent_agents_and_says_so(capsys: pytest.CaptureFi
             plan_control("arrow_puzzle", "sample_efficiency", **agents)
     models, note = registry.installed_of(("copy", "structured"), registry.WORLD_MODEL_GROUP)
     assert models == ("copy",) and note == f"Left out, as not installed: structured. {install}"
+    agents, note = registry.installed_of(("dqn", "factored:given,planning.depth=1"))
+    assert agents == ("dqn",) and note == f"Left out, as not installed: factored:given,planning.depth=1. {install}"
 
 
 def test_a_default_has_every_agent_where_all_are_installed() -> None:

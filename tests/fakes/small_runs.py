@@ -115,6 +115,11 @@ def exact(value: Any) -> Any:
     return repr(value)
 
 
+def made_bench(wanted: Protocol, root: Path) -> BenchResult:
+    """A bench in this process, of agents that need no file."""
+    return bench(wanted, {}, root=root, launcher=Inline())
+
+
 class Inline:
     """A launcher without processes that notes its order of work, and gives up after so many jobs."""
 

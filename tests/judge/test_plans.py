@@ -8,7 +8,7 @@ import json
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsFloat
 from unittest import mock
 
 import numpy as np
@@ -17,19 +17,19 @@ from bench_fakes import RulesImaginer
 from imagine_bench.tasks.arrows.rules import ArrowRules
 from numpy.typing import NDArray
 from recordings import contents, logged
-from small_runs import Inline, context, small
+from small_runs import context, made_bench, small
 from whole_outputs import Expected, rounded
 
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Frame, PhysicsSettings, State
 from imagine_bench.interfaces.capabilities import ImaginedRollout
+from imagine_bench.interfaces.environments import Wrapper
 from imagine_bench.judge.plans import PlanResult, carry_out, make_env, make_plans
 from imagine_bench.protocols.control import protocol
 from imagine_bench.protocols.data import RunSpec
 from imagine_bench.recording.plans import record_plans
 from imagine_bench.rules import Outcome, fewest_actions
-from imagine_bench.running.bench import bench
 from imagine_bench.running.trained import Trained
 from imagine_bench.tools.audits import plan_report, summarise, write_plans
 
@@ -99,6 +99,24 @@ def test_a_start_that_the_rules_cannot_solve_has_no_shortest_plan(tmp_path: Path
     write_plans(tmp_path, [plan], TASK, {})
     (row,) = csv.DictReader((tmp_path / "plans.csv").read_text().splitlines())
     assert (row["shortest"], row["solved"], row["optimal"]) == ("", "1", "0")
+
+
+class Faulty(Wrapper):
+    """Each macro-action but the first has a fault."""
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        *after, info = self.env.step(action)
+        is_first, self.begun = not self.begun, True
+        return *after, {**info, "fault": "" if is_first else "it slipped"}  # type: ignore[return-value]
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        self.begun = False
+        return self.env.reset(**options)
+
+
+def test_the_faults_of_a_plan_are_those_of_its_macro_actions() -> None:
+    plans = [carry_out(Faulty(Dreamer.env), trained(optimal()), number) for number in range(3)]
+    assert [plan.faults for plan in plans] == [plan.done - 1 for plan in plans] and max(p.done for p in plans) > 2
 
 
 def carried_out(dreamer: Dreamer, count: int, seed: int = 0, **options: Any) -> list[PlanResult]:
@@ -226,6 +244,9 @@ def test_a_detour_is_solved_but_not_optimal() -> None:
     (plan,) = carried_out(Dreamer(wander), 1)
     assert plan.solved and not plan.optimal
     assert plan.outcome == "solved, 2 longer than needed"
+    beyond = dataclasses.replace(plan.compared.rollout, actions=np.append(plan.compared.rollout.actions, 0))
+    longer = dataclasses.replace(plan, compared=dataclasses.replace(plan.compared, rollout=beyond))
+    assert longer.outcome == plan.outcome, "what was not carried out costs nothing"
 
 
 class Cautious(RulesImaginer):
@@ -289,7 +310,7 @@ def test_no_agent_without_imagination() -> None:
 def test_plans_of_other_options_lie_in_other_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """So that none overwrites the table and the films of those before; each names the world that it was tried in."""
     imaginer = small(agents=("imaginer",), budgets=(2,), evaluation_episodes=1, test_appearance="mild")
-    folder = bench(imaginer, {}, root=tmp_path, launcher=Inline()).folder
+    folder = made_bench(imaginer, tmp_path).folder
     recording = mock.Mock()
     monkeypatch.setattr("imagine_bench.recording.plans.record_plans", recording)
     for count, bound in [(1, None), (1, 0.3), (1, 0.0), (2, None)]:

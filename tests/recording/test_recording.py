@@ -335,8 +335,10 @@ def test_imagination_is_set_beside_its_own_episode_alone(tmp_path: Path, monkeyp
         assert before in ([], [*earlier, state])
 
 
-def test_of_so_many_seeds_alone_runs_are_recorded(tmp_path: Path) -> None:
-    wanted = small(agents=("random",), seeds=(4, 5), budgets=(1,), recorded_episodes=1, recorded_seeds=1)
+@pytest.mark.parametrize(("seeds", "recorded"), [(1, [True, False]), (0, [True, True])])
+def test_of_so_many_seeds_alone_or_of_all_runs_are_recorded(tmp_path: Path, seeds: int, recorded: list[bool]) -> None:
+    few = {"budgets": (1,), "evaluation_episodes": 1, "recorded_episodes": 1}
+    wanted = small(agents=("random",), seeds=(4, 5), recorded_seeds=seeds, **few)
     result = bench(wanted, {}, root=tmp_path, launcher=Inline())
-    assert [run.recording is not None for run in result.runs] == [True, False]
+    assert [run.recording is not None for run in result.runs] == recorded
     assert bench(wanted, {}, root=tmp_path, launcher=Inline(patience=0)).missing == (), "no run lacks anything"

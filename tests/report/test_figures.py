@@ -53,13 +53,23 @@ def test_the_success_figure_draws_scores_bands_and_the_thesis(data: ReportData) 
     assert any(np.allclose(each, thesis) for each in lines(axes) if len(each) == len(thesis))
     bars = [[(x, 100.0 * (mean + std)) for std in (-std, std)] for x, (mean, std) in data.thesis["dqn"].items()]
     assert any(np.allclose(each.get_segments(), bars) for each in axes.collections if isinstance(each, LineCollection))
-    short = bench_result(data.result.folder, protocol=dataclasses.replace(WIDE, budgets=(10, 20)))
-    assert success_figure(collect(short)).axes[0].get_xlim()[1] < 25, "far points of the thesis do not stretch it"
+    short = bench_result(data.result.folder, protocol=dataclasses.replace(WIDE, budgets=(800, 1000, 1240)))
+    (axes,) = success_figure(collect(short)).axes
+    assert axes.get_xlim()[1] < 2600, "far points of the thesis do not stretch it"
+    ticks = {axes.get_xticks()[place]: label.get_text() for place, label in enumerate(axes.get_xticklabels())}
+    assert ticks == {800: "800", 1000: "", 1240: "1,240"}, "words that would overlap are left out"
 
 
 def test_the_open_loop_figure_draws_the_means_of_the_file_by_depth(data: ReportData) -> None:
     """The first macro-action that is imagined has depth 1."""
     loops = open_loop_means(data.result)
+    first = next(run for run in data.result.runs if run.agent == "imagination").checkpoints[-1].open_loop
+    assert first is not None
+    known = first.auroc_epistemic.copy()
+    first.auroc_epistemic[0] = np.nan
+    some = open_loop_means(data.result)["imagination"]["auroc_epistemic"]
+    first.auroc_epistemic[0] = known[0]
+    assert some == pytest.approx(known), "of the runs in which it is known"
     assert loops["imagination"]["count"].tolist() == [100 * len(WIDE.seeds)] * DEPTH
     assert np.isnan(loops["imagination"]["auroc_modal"][0]), "unknown in every run"
     panels = {axes.get_title(): lines(axes) for axes in open_loop_figure(loops).axes}

@@ -21,7 +21,7 @@ from imagine_bench.protocols.control import Protocol
 from imagine_bench.registry.entries import FIRST, TODAY
 from imagine_bench.report.bench import bench_page, shown, verdict
 from imagine_bench.report.data import DIFFERENCE, SCORE, collect
-from imagine_bench.report.page import Page, Table, number, write_page
+from imagine_bench.report.page import Page, Table, number, p_level, write_page
 from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
 
 
@@ -35,6 +35,16 @@ from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
 )
 def test_a_number_is_printed_to_three_digits(value: float, words: str) -> None:
     assert number(value) == words
+
+
+def test_a_p_value_is_said_to_be_below_the_next_level() -> None:
+    words = ["p < .001", "p < .01", "p < .05", "p < .05", "p < 1.01"]
+    assert [p_level(p) for p in (0.0009, 0.001, 0.01, 0.0499, 0.05)] == words
+
+
+def test_columns_for_a_terminal_are_at_most_80_characters_wide() -> None:
+    texts = [Table("wide", ["a" * 10, "b" * 38, "c" * last], [["1", "2", "3"]]).text for last in (28, 29)]
+    assert [[len(line) for line in text.splitlines()] for text in texts] == [[80, 80, 80], [50, 50, 50, 0, 41, 41, 41]]
 
 
 @pytest.fixture(scope="module")
@@ -120,6 +130,14 @@ def test_verdicts(many: BenchResult, result: BenchResult, headed: BenchResult, e
     same = {**three.environment, "command": "imagine-bench bench x --seeds=0-1 7 --workers 1"}
     first, other = (verdict(collect(dataclasses.replace(three, environment=each))) for each in (typed, same))
     assert first == other, "seeds are typed in two ways"
+    for command in ("imagine-bench bench x; imagine-bench bench y", "python -c 'import imagine_bench'"):
+        merged = dataclasses.replace(three, environment={"command": command})
+        assert all(line.endswith("; about 2 more would decide.") for line in verdict(collect(merged))), "no one command"
+    worse, *_ = verdict(collect(shifted(headed, dqn=above(49), imagination=BASE)))
+    assert worse.startswith("imagination: worse than dqn, \u221224.5 [") and "(p < .001)" in worse
+    brief = dataclasses.replace(headed.protocol, seeds=(0, 1, 2))
+    first, *_ = verdict(collect(bench_result(headed.folder / "brief", protocol=brief)))
+    assert re.match(r"imagination: \S+ points at 6,000 against dqn, undecided with 3 seeds; ", first)
 
 
 def test_one_seed_hides_no_difference_of_others(many: BenchResult) -> None:
@@ -157,7 +175,10 @@ def test_a_difference_is_shown_only_after_holms_correction(many: BenchResult) ->
         ({"demonstrations": 1_000_000}, "first training episodes demonstrated: 6,000"),
         ({"queries": 2}, "up to 2 oracle queries an episode"),
         ({"feedback": 5.0, "feedback_error": 0.2}, "a teacher's feedback of 5, wrong in 20.0 %"),
-        ({"after": ("arrow_puzzle_hard",)}, "trained before on arrow_puzzle_hard, 100 episodes each"),
+        (
+            {"after": ("arrow_puzzle_hard", "arrow_puzzle_toward"), "after_episodes": 1500},
+            "trained before on arrow_puzzle_hard, arrow_puzzle_toward, 1,500 episodes each",
+        ),
         (
             {"after": ("arrow_puzzle_hard",), "unannounced": True},
             "trained before on arrow_puzzle_hard, 100 episodes each, without notice of a change",
@@ -202,6 +223,15 @@ def test_missing_and_doubled_runs_are_refused(result: BenchResult) -> None:
 
 
 # The page ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("commit", "words"), [("0123+changes.4567", "git checkout 0123 && "), (None, "")])
+def test_the_line_that_repeats_a_bench_begins_at_its_commit(
+    result: BenchResult, commit: str | None, words: str
+) -> None:
+    facts = {**result.environment, "commit": commit}
+    made = bench_page(dataclasses.replace(result, environment=facts)).facts
+    assert made["reproduce"] == f"{words}{facts['command']}"
 
 
 def test_the_page_can_be_read_alone_and_shows_every_figure(folder: Path) -> None:

@@ -27,10 +27,10 @@ FIRST = Protocol(
     task="arrow_puzzle",
     preset="quick",
     agents=("random", "dqn", "dqn_more_updates", "imagination"),
-    seeds=(0, 1, 2, 3, 4, 5, 6),
+    seeds=tuple(range(30, 37)),
     budgets=(100, 500),
     headlines=PAIRS,
-    few_seeds=(("random", 2), ("imagination", 4), ("dqn", 4)),
+    few_seeds=(("random", 32), ("imagination", 34), ("dqn", 34)),
 )
 
 
@@ -77,7 +77,7 @@ def staged(tmp_path: Path) -> Callable[[int, list[Protocol]], Callable[..., Benc
 
     def with_gap(gap: int, asked: list[Protocol]) -> Callable[..., BenchResult]:
         def plan(**changes: Any) -> BenchResult:
-            few = tuple((agent, most - 1) for agent, most in changes.pop("few_seeds", {}).items())
+            few = tuple((agent, FIRST.seeds[0] + most - 1) for agent, most in changes.pop("few_seeds", {}).items())
             asked.append(dataclasses.replace(FIRST, few_seeds=few, **changes))
             return result_of(asked[-1], tmp_path, gap)
 
@@ -92,7 +92,7 @@ def test_stages_end_once_decided_or_at_the_most(staged: Any, tmp_path: Path, gap
     asked: list[Protocol] = []
     *_, whole = until_decided(staged(gap, asked), FIRST, most=14, root=tmp_path)
     assert decided(whole) == (gap > 0)
-    assert whole.protocol.agents == FIRST.agents and whole.protocol.seeds == tuple(range(seeds))
+    assert whole.protocol.agents == FIRST.agents and whole.protocol.seeds == tuple(range(30, 30 + seeds))
     counts = {agent: len(whole.success_rates(agent)) for agent in FIRST.agents}
     assert counts == {"random": 3, "dqn": seeds - 2, "dqn_more_updates": seeds, "imagination": seeds - 2}
     runs = [(agent, seed) for each in asked for agent in each.agents for seed in each.seeds_of(agent)]

@@ -52,6 +52,7 @@ def test_choices_in_any_order_are_one_bench() -> None:
         Protocol(task="arrow_puzzle", preset="quick", observation=each) for each in ("state,frame", "frame,state")
     )
     assert one == other and one.world["observation"] == "frame,state" and "privileged" in one.appearance_in_words
+    assert Protocol(task="arrow_puzzle", preset="quick", test_appearance="clean").appearance_in_words == "clean"
 
 
 def test_what_an_agent_cannot_be_shown_is_one_sentence() -> None:

@@ -127,6 +127,7 @@ def test_a_dataset_that_changed_since_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("task", "changes", "words"),
     [
+        ("arrow_puzzle", {"agents": ("sb3_dqn_latents",)}, "trains in a loop of its own; leave --dataset out, or"),
         ("arrow_puzzle", {"agents": ("q_learning_macrostate",)}, "is shown true macrostates; leave --dataset out, or"),
         ("arrow_puzzle", {"demonstrations": 2}, "Both a dataset and demonstrations would come first; give one"),
         # an encoder for clean frames would make nothing of these

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small_runs import Inline, do, measured
+from small_runs import Inline, do, made_bench, measured
 
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
@@ -17,8 +17,8 @@ from imagine_bench.errors import BusyError, ImagineBenchError, InvalidValueError
 from imagine_bench.exact.certificate import certificate
 from imagine_bench.judge.verify import verify_runs
 from imagine_bench.protocols.control import Protocol, protocol
-from imagine_bench.running.bench import bench
 from imagine_bench.running.player import FinishedError, PlayedRun, played_run, protocol_of_player
+from imagine_bench.running.retraining import Retraining, train_again
 from imagine_bench.store import run_folder
 from imagine_bench.store.files import write_json
 from imagine_bench.store.loading import load_so_far, merge
@@ -31,6 +31,11 @@ SPEC = registry.task("arrow_puzzle")
 def wanted(name: str = "anna", **options: object) -> Protocol:
     values: dict[str, object] = {"tests": 4, "execution": "kinematic", **options}
     return protocol_of_player("arrow_puzzle", "person", name, **values)  # type: ignore[arg-type]
+
+
+def like(bench: Path, **options: Any) -> Protocol:
+    """As a bench has it."""
+    return protocol_of_player(None, "person", "anna", like=bench, **options)
 
 
 def lasting(macrostate: tuple[int, ...], number: int, moves: int) -> int:
@@ -89,7 +94,6 @@ def test_a_persons_run_is_verified_explained_and_reported(anna: Path, tmp_path: 
     shutil.copytree(anna.parents[1], folder)
     row = run_folder.load_run(anna).checkpoints[0]
     assert (row.test_episodes, row.solved, row.env_steps) == (4, "0101", 0)
-    assert [verdict.complaint for verdict in verify_runs(folder)] == ["", ""]
     assert not any(verdict.unshown for verdict in verify_runs(folder))
     said = why_report(folder, root=tmp_path, task=None, encoder=None)
     assert "2 of 4" in said and "decision" in said
@@ -97,6 +101,8 @@ def test_a_persons_run_is_verified_explained_and_reported(anna: Path, tmp_path: 
     page = (folder / "report" / "index.html").read_text()
     assert "person:anna" in page and "A person at the keyboard" in page
     assert main(["verify", str(folder)]) == 0
+    (again,) = train_again(folder, Retraining(runs=1, nonce="", launcher=Inline()))
+    assert not again.complaint and "cannot be trained here" in again.unshown[0]
 
 
 @pytest.mark.parametrize("training", [None, 3])
@@ -108,7 +114,7 @@ def test_an_interrupted_run_ends_in_the_same_bits(training: int | None, tmp_path
     with played_run(chosen, root) as run:
         play_one(run, most=2)
     with played_run(chosen, root) as run:
-        assert run.moves == 0
+        assert run.words == (f"training episode 1 of {training}" if training else "test 1 of 4") and run.moves == 0
         run.reset()
         assert run.moves == 2, "the episode that was left goes on"
         play_one(run)
@@ -116,8 +122,11 @@ def test_an_interrupted_run_ends_in_the_same_bits(training: int | None, tmp_path
     with played_run(chosen, tmp_path / "killed") as run:
         run.reset()
         assert (run.number, run.moves) == (1, 0)
+        assert run.words == (f"training episode 2 of {training}" if training else "test 2 of 4")
         play_one(run, most=1)
     parts = [play_all(chosen, each) for each in (root, tmp_path / "killed")]
+    with played_run(chosen, root) as run:
+        assert run.words == f"all {4 + (training or 0)} episodes are played"
     assert content(parts[0]) == content(parts[1]) == content(whole)
     verdicts = verify_runs(parts[1].parents[1])
     assert not any(verdict.complaint for verdict in verdicts)
@@ -167,14 +176,20 @@ def test_an_appearance_that_is_asked_for_is_that_of_the_tests(tmp_path: Path) ->
     there = protocol("arrow_puzzle", "smoke", agents=("random",), test_appearance="strong")
     write_json(tmp_path / "protocol.json", there.as_dict())
     for asked, found in ((None, "strong"), ("mild", "mild")):
-        wanted = protocol_of_player(None, "person", "anna", like=tmp_path, appearance=asked)
+        wanted = like(tmp_path, appearance=asked)
         assert wanted.appearance_in_tests == found
 
 
-def test_no_player_trains_on_the_fragments_of_its_tests() -> None:
+def test_no_player_trains_otherwise_than_it_is_tested(tmp_path: Path) -> None:
     assert wanted(appearance="patched").appearance_in_tests == "photo_held_out"
     with pytest.raises(InvalidValueError, match=r"The appearance patched .* trains otherwise than it tests"):
         wanted(appearance="patched", training=1)
+    for change in ({"split": "plan_length=2"}, {"queries": 1}, {"test_appearance": "mild"}):
+        there = protocol("arrow_puzzle", "smoke", **{"agents": ("factored:given",), **change})
+        write_json(tmp_path / "protocol.json", there.as_dict())
+        assert like(tmp_path)
+        with pytest.raises(InvalidValueError, match=f"{tmp_path} shows more than frames, or trains otherwise"):
+            like(tmp_path, training=1)
 
 
 def test_a_person_is_told_the_chance_of_the_starts_of_the_tests(
@@ -183,7 +198,7 @@ def test_a_person_is_told_the_chance_of_the_starts_of_the_tests(
     there = protocol("arrow_puzzle", "smoke", agents=("random",), split="plan_length=2", execution="kinematic")
     write_json(tmp_path / "protocol.json", there.as_dict())
     monkeypatch.setattr(play, "keyboard_player", lambda: lambda game, **options: None)
-    said = play.keep_playing(protocol_of_player(None, "person", "anna", like=tmp_path), tmp_path / "runs")
+    said = play.keep_playing(like(tmp_path), tmp_path / "runs")
     chance = certificate(there.spec(testing=True)).chance_level
     assert f"chance {chance:.1%}, optimum 100.0%" in said and f"{SPEC.facts().chance_level:.1%}" not in said
 
@@ -195,7 +210,7 @@ def test_nothing_of_the_learners_of_a_bench_is_said_of_a_player(tmp_path: Path) 
     for changes in ({}, made, {"agents": ("dqn", "oracle"), "few_seeds": (("oracle", 0),), "seeds": (0, 1)}):
         there = dataclasses.replace(plain, **changes)
         write_json(tmp_path / "protocol.json", there.as_dict())
-        players.append(protocol_of_player(None, "person", "anna", like=tmp_path))
+        players.append(like(tmp_path))
     assert players[0] == players[1] == players[2]
 
 
@@ -205,8 +220,8 @@ def test_a_person_stands_in_the_table_of_a_bench(tmp_path: Path) -> None:
         "arrow_puzzle", "smoke", agents=("random", "oracle"), seeds=(3, 5), evaluation_episodes=9,
         execution="kinematic", overrides=(("controller.discount", 0.9),),
     )  # fmt: skip
-    there = bench(planned, {}, root=tmp_path, launcher=Inline())
-    played = protocol_of_player(None, "person", "anna", tests=4, like=there.folder)
+    there = made_bench(planned, tmp_path)
+    played = like(there.folder, tests=4)
     mine = load_so_far(play_all(played, tmp_path).parents[1])
     table = merge([there, mine], tmp_path)
     assert table.protocol.evaluation_episodes == 4

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+import io
+import re
 from typing import Any
 
 import pytest
@@ -9,6 +13,7 @@ from bench_fakes import FakeRunSpec
 from small_runs import small
 
 from imagine_bench.protocols.data import Phase, Progress
+from imagine_bench.registry import AGENTS
 from imagine_bench.running.bench import ProgressBar, counted
 
 WORK = 9 + 2 * 5
@@ -31,25 +36,35 @@ def now_s(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 
 @pytest.mark.parametrize(
-    ("gone_s", "times"),
+    ("gone_s", "cost", "times"),
     [
-        (36_000.0, "10:00:00 elapsed, about 34 h left"),
-        (1_500.0, "25:00 elapsed, about 85 min left"),
-        (20.0, "00:20 elapsed, about 68 s left"),
+        (36_000.0, 1.0, "10:00:00 elapsed, about 34 h left"),
+        (1_500.0, 1.0, "25:00 elapsed, about 85 min left"),
+        (20.0, 1.0, "00:20 elapsed, about 68 s left"),
+        (20.0, 2.0, "00:20 elapsed, about 53 s left"),
     ],
 )
+@pytest.mark.parametrize("is_terminal", [False, True])
 def test_time_left_counts_no_earlier_or_failed_work(
-    gone_s: float, times: str, now_s: list[float], capsys: pytest.CaptureFixture[str]
+    gone_s: float, cost: float, times: str, is_terminal: bool, now_s: list[float], own_names: None
 ) -> None:
-    """Of 72 parts, 9 were done before and 10 take this time; 34 are left, for a run that failed has 19."""
-    with ProgressBar(SPECS) as show:
+    """Of 72 parts, 9 were done before and 10 take this time; 34 are left, for a run that failed has 19.
+
+    A run of twice the cost has parts that take twice as long. A terminal is shown the share of all work too.
+    """
+    AGENTS["table"] = dataclasses.replace(AGENTS["table"], relative_cost=cost)
+    screen = io.StringIO()
+    screen.isatty = lambda: is_terminal  # type: ignore[method-assign]
+    with contextlib.redirect_stderr(screen), ProgressBar(SPECS) as show:
         show(far(0, 9))
         show(far(1, 0, "failed", detail="RuntimeError: it broke"))
         now_s[0] = gone_s
         show(far(0, WORK, "done"))
-    said, line = capsys.readouterr().err.splitlines()
-    assert said == "table seed 1 failed: RuntimeError: it broke"
-    assert line.startswith(f"1/6 runs · {times}")
+        *_, said, line = re.split(r"[\r\n]+", screen.getvalue().rstrip())
+    assert "table seed 1 failed: RuntimeError: it broke" in screen.getvalue()
+    assert f"1/6 runs · {times}" in line
+    share = 100 * WORK * cost / (2 * WORK * cost + 3 * 5)
+    assert line.startswith(f"{share:3.0f} % |" if is_terminal else "1/6 runs"), said
 
 
 def test_a_minute_shows_each_run_and_its_curve(now_s: list[float], capsys: pytest.CaptureFixture[str]) -> None:

@@ -125,6 +125,8 @@ def test_each_option_of_training_is_known_as_help_that_needs_a_learner():
     for changes in ({"demonstrations": 2}, {"queries": 1}, {"feedback": 1.0}):
         with pytest.raises(UnableError, match=f"No agent of this bench learns .*--{next(iter(changes))} changes"):
             plan_control("arrow_puzzle", "smoke", agents=("random",), **changes)
+    with pytest.raises(InvalidValueError, match="with it a probability of at most"):
+        dataclasses.replace(made, feedback_error=0.6)
 
 
 def test_agents_of_a_file_that_are_no_names_are_refused():

@@ -31,6 +31,7 @@ from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.protocols.data import Progress, RunSpec
 from imagine_bench.recording import episodes
 from imagine_bench.registry import AgentEntry
+from imagine_bench.rules import states_of
 from imagine_bench.running.evaluation import start_from
 from imagine_bench.running.run_state import Counters, make_env
 from imagine_bench.seeding import TUNING_SEEDS, episode_seed
@@ -101,10 +102,13 @@ def test_tests_and_recordings_have_their_own_starts_and_looks(
 
 
 def test_a_run_counts_what_happens(tmp_path: Path) -> None:
-    spec = RunSpec(protocol=small(), agent="table", seed=3)
-    result = run_observed(spec, tmp_path / "run", lambda progress: None)
-    assert [row.episodes for row in result.checkpoints] == [4, 9]
-    assert result.training_length.shape == result.training_success.shape == (9,)
+    spec = RunSpec(protocol=small(budgets=(4, 60)), agent="table", seed=3)
+    heard: list[Progress] = []
+    result = run_observed(spec, tmp_path / "run", heard.append)
+    assert [row.episodes for row in result.checkpoints] == [4, 60]
+    assert result.training_length.shape == result.training_success.shape == (60,)
+    recent = result.training_success[10:].mean()
+    assert heard[-1].success == recent != result.training_success.mean(), "of the last 50"
     steps = [row.env_steps for row in result.checkpoints]
     assert steps == [result.training_length[:4].sum(), result.training_length.sum()]
     assert [row.diagnostics["real_transitions"] for row in result.checkpoints] == steps
@@ -121,6 +125,8 @@ def test_a_run_is_through_with_its_work_at_its_end(tmp_path: Path, agent: str) -
     run_observed(spec, tmp_path, heard.append)
     assert heard[-1].phase == "done" and heard[-1].done == heard[-1].work
     assert [each.done for each in heard] == sorted(each.done for each in heard)
+    snapshot = load_newest(tmp_path / "checkpoints")
+    assert snapshot is not None and snapshot.values["before"] == (3 if agent == "table" else 0)
 
 
 def test_only_the_privileged_are_shown_more_than_frames(tmp_path: Path) -> None:
@@ -205,7 +211,11 @@ def test_a_loop_of_its_own_has_all_agents_starts_and_own_cpu_time(
     monkeypatch.setattr(time, "process_time", lambda: Elsewhere.clock_s)
     result = do(tmp_path / "own", "elsewhere", 3, agents=("elsewhere",), **of)
     assert Elsewhere.given == {"episodes": 5, "horizon": 7, "played": 5}
-    assert [row.train_cpu_s for row in result.checkpoints] == [2.0, 5.0] and result.checkpoints[0].eval_cpu_s >= 100.0
+    rules = registry.task(of["task"]).rules
+    asked = sum(not rules.is_terminal(state) for state in states_of(rules))
+    for row, train_cpu_s in zip(result.checkpoints, (2.0, 5.0), strict=True):
+        assert row.kept is not None and row.train_cpu_s == train_cpu_s
+        assert row.eval_cpu_s == 100.0 * (row.kept.lengths.sum() + asked), "of tests, and of its beliefs"
     assert usual.training is not None and result.training is not None
     starts, others = result.training.starts.tolist(), usual.training.starts.tolist()
     assert starts == [*others[:2], [1, 2, 3, 0], *others[3:], starts[-1]] and len(starts) == 6

@@ -11,9 +11,11 @@ from small_runs import Inline, small
 
 from imagine_bench import registry
 from imagine_bench.errors import ArtefactError
+from imagine_bench.protocols.data import Encoders, ProtocolData
 from imagine_bench.report.bench import bench_page
 from imagine_bench.report.page import texts
 from imagine_bench.running import bench as benches
+from imagine_bench.store.files import read_sealed, sealed, write_json
 from imagine_bench.store.loading import load_so_far
 from imagine_bench.store.results import BenchResult
 
@@ -26,7 +28,10 @@ def bench(root: Path, launcher: Inline, **changes: object) -> BenchResult:
     return benches.bench(wanted, {}, root=root, launcher=launcher)
 
 
-def test_agents_without_a_result_are_left_out_once_all_others_are_finished(tmp_path: Path) -> None:
+def test_a_bench_without_a_run_is_read_and_goes_on_elsewhere(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Agents without a result are left out once all others are finished."""
     with pytest.raises(KeyboardInterrupt):
         bench(tmp_path, Inline(patience=1), seeds=(0,))
     (folder,) = tmp_path.glob("arrow_puzzle/*")
@@ -35,6 +40,14 @@ def test_agents_without_a_result_are_left_out_once_all_others_are_finished(tmp_p
     part = load_so_far(folder)
     assert (part.protocol.agents, part.protocol.budgets) == ((done,), (2, 4, 9))
     assert part.missing == (f"{other} seed 0: 0 of 9 real episodes",)
+    facts = read_sealed(folder / "sessions.json", "sessions")
+    facts["environment"]["machine"]["cpu"] = "another"
+    write_json(folder / "sessions.json", sealed(facts))
+    for reads in (False, True):  # it goes on, and is then only read
+        bench(tmp_path, Inline(), seeds=(0,))
+        said = capsys.readouterr().out
+        assert f"Note: {folder} was begun with another cpu. Runs it finished are kept" in said
+        assert ("nothing was run" in said) == reads
 
 
 def test_a_bench_lacks_its_unfinished_runs_alone(tmp_path: Path) -> None:
@@ -66,6 +79,13 @@ def test_a_bench_lacks_its_unfinished_runs_alone(tmp_path: Path) -> None:
     part = load_so_far(folder)
     assert part.protocol == result.protocol == part.whole
     assert part.missing == ("table seed 0: its recording",)
+
+
+def test_missing_runs_of_several_benches_are_counted_each_once(tmp_path: Path) -> None:
+    one, other = (small(agents=(agent,), seeds=(0, 1), evaluation_episodes=1) for agent in ("random", "oracle"))
+    planned: list[tuple[ProtocolData, Encoders]] = [(one, {}), (other, {}), (one, {})]
+    for missing in (4, 0):
+        assert benches.carry_out(planned, root=tmp_path, launcher=Inline()) == ([], missing)
 
 
 @pytest.mark.usefixtures("own_names")

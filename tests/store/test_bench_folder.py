@@ -107,7 +107,7 @@ def test_the_newest_bench_or_recording_of_some_tasks_or_of_all(tmp_path: Path) -
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
         os.utime(path, (time_s, time_s))
-    assert newest_recording(tmp_path) == other
+    assert newest_recording(tmp_path) == newest_recording(tmp_path, "arrow_puzzle", "robot_ik") == other
     for newest in (optioned, run, plan):  # with any options; and that of a plan
         assert newest_recording(tmp_path, "arrow_puzzle") == newest
         newest.unlink()

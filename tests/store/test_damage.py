@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from small_runs import Inline, do_by, of_before_digests, same_but_for_time, small
+from small_runs import do_by, made_bench, of_before_digests, same_but_for_time, small
 
 from imagine_bench.adapters.tracking import track
 from imagine_bench.errors import ArtefactError, SetupError
-from imagine_bench.running.bench import bench, load_bench
+from imagine_bench.running.bench import load_bench
 from imagine_bench.store.bench_folder import bench_folder
 from imagine_bench.store.files import lock, read_json, write_bytes
 from imagine_bench.store.loading import load_so_far as load_so_far_of_bench
@@ -37,7 +37,7 @@ _SEALED = ["config.json", "metrics.csv", "imagined.npz", "agent.safetensors", "r
 
 @pytest.mark.parametrize("name", _SEALED)
 def test_a_part_that_a_finished_bench_lost_is_named(tmp_path: Path, name: str) -> None:
-    whole = bench(small(), {}, root=tmp_path, launcher=Inline()).folder
+    whole = made_bench(small(), tmp_path).folder
     (path,) = whole.rglob(name)
     path.unlink()
     for read in (load_so_far_of_bench, load_bench, lambda folder: track(folder, "tensorboard")):

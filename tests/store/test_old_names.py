@@ -16,6 +16,7 @@ from imagine_bench.protocols.control import Protocol, protocol
 from imagine_bench.registry.entries import agent_label, edition_of, label_today, name_in_edition_1
 from imagine_bench.running.bench import bench, plan, read_protocol
 from imagine_bench.store.bench_folder import bench_folder
+from imagine_bench.store.loading import archive_files, load_so_far
 
 KEPT = Path(__file__).parent / "of_abcb05c" / "two_names"
 """A bench of ``factored``, killed within its second test, and of ``factored_own``, which was done."""
@@ -80,3 +81,6 @@ def test_a_kept_bench_has_todays_labels_and_its_own_version(tmp_path: Path) -> N
     for name, array in sorted(final_arrays(folder / runs[1]).items()):
         learned.update(name.encode() + array.tobytes())
     assert learned.hexdigest()[:16] == LEARNED
+    for name, text in archive_files(load_so_far(KEPT)).items():
+        (tmp_path / name).write_text(text)
+    assert {run.agent for run in load_so_far(tmp_path).runs} == {*kept.agents}

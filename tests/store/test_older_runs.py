@@ -9,9 +9,9 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-from small_runs import Inline, final_arrays, of_before_digests, same_but_for_time, small
+from small_runs import final_arrays, made_bench, of_before_digests, same_but_for_time, small
 
-from imagine_bench.running.bench import bench, load_bench, read_protocol
+from imagine_bench.running.bench import load_bench, read_protocol
 from imagine_bench.store.bench_folder import bench_folder
 from imagine_bench.store.loading import load_so_far
 from imagine_bench.store.results import BenchResult
@@ -25,7 +25,7 @@ def test_a_killed_bench_is_read_and_ends_in_the_bits_of_a_whole_one(tmp_path: Pa
     folder = bench_folder(tmp_path, protocol)
     shutil.copytree(OLDER / "killed", folder)
     assert load_so_far(folder).protocol.budgets == (4,)
-    result = bench(small(), {}, root=tmp_path, launcher=Inline())
+    result = made_bench(small(), tmp_path)
     assert isinstance(result, BenchResult)
     shutil.copytree(OLDER / "whole", tmp_path / "whole")
     whole = load_bench(tmp_path / "whole")

@@ -80,14 +80,18 @@ def test_every_variant_is_run_once_and_compared(
     assert [row["imagined_right"] for row in rows][4:] == ["0.1000", "0.2000", "0.3000", "0.4000"]
 
 
-def test_rows_of_a_study_name_the_seeds_of_their_runs(tmp_path: Path) -> None:
-    blind = Variant(name="blind", agent="random")
-    study = dataclasses.replace(STUDY, seeds=(1001, 1000), budgets=(1,), evaluation_episodes=60, variants=(blind,))
-    lines = run_study(study, "arrow_puzzle", root=tmp_path, launcher=Inline())
-    rows = csv.DictReader(study_page(study, lines).files["seeds.csv"].splitlines())
-    told = {int(row["seed"]): float(row["success"]) for row in rows}
-    kept = {run.seed: run.checkpoints[0].success_rate for run in load_bench(lines[0].folder).runs}
-    assert told == pytest.approx(kept, abs=1e-5) and kept[1000] != kept[1001]
+def test_rows_of_a_study_are_those_of_its_runs_and_are_loaded(tmp_path: Path) -> None:
+    table = Variant(name="table", agent="table")
+    study = dataclasses.replace(STUDY, seeds=(1001, 1000), budgets=(15, 30), evaluation_episodes=40, variants=(table,))
+    (line,) = run_study(study, "arrow_puzzle", root=tmp_path, launcher=Inline())
+    kept = load_bench(line.folder)
+    assert line.train_cpu_s == np.mean([run.checkpoints[-1].train_cpu_s for run in kept.runs]) > 0.0
+    write_page(tmp_path / "out", study_page(study, [line]))
+    frame = imagine_bench.load(tmp_path / "out").frame()
+    told = zip(frame["seed"], frame["episodes"], frame["success"], strict=True)
+    rates = {(run.seed, row.episodes): row.success_rate for run in kept.runs for row in run.checkpoints}
+    assert {(seed, budget): rate for seed, budget, rate in told} == pytest.approx(rates, abs=1e-5)
+    assert len(set(rates.values())) > 1 and set(frame["protocol"]) == {kept.protocol.hash}
 
 
 def test_settings_in_the_name_of_an_agent_may_be_spelled_in_any_way(tmp_path: Path) -> None:
@@ -95,15 +99,6 @@ def test_settings_in_the_name_of_an_agent_may_be_spelled_in_any_way(tmp_path: Pa
     study = dataclasses.replace(STUDY, seeds=(1000,), budgets=(1,), evaluation_episodes=1, variants=(spelled,))
     (line,) = run_study(study, "arrow_puzzle", root=tmp_path, launcher=Inline())
     assert line.success.shape == line.imagined_right.shape == (1, 1)
-
-
-def test_a_study_that_was_written_is_loaded(tmp_path: Path) -> None:
-    study = dataclasses.replace(STUDY, budgets=(1, 2), variants=(Variant(name="blind", agent="random"),))
-    page = study_page(study, run_study(study, "arrow_puzzle", root=tmp_path, launcher=Inline()))
-    write_page(tmp_path / "out", page)
-    frame = imagine_bench.load(tmp_path / "out").frame()
-    assert list(zip(frame["seed"], frame["episodes"], strict=True)) == [(s, b) for s in (1000, 1001) for b in (1, 2)]
-    assert all(isinstance(each, str) for each in frame["protocol"])
 
 
 def test_a_difference_is_that_from_what_a_variant_is_compared_with(tmp_path: Path) -> None:
@@ -166,6 +161,7 @@ def test_a_study_from_a_file_changes_the_world_too(tmp_path: Path) -> None:
     study = read_grid(path)
     assert (study.name, study.execution, study.variants[0].factor) == ("mine", "kinematic", BASE)
     run_study(study, "arrow_puzzle", root=tmp_path, launcher=launcher)
+    assert {job.spec.protocol.preset for job in launcher.jobs} == {"smoke"}
     worlds = [(job.spec.protocol.appearance_in_words, job.spec.protocol.world) for job in launcher.jobs]
     assert worlds == [
         ("clean", {"execution": "kinematic"}), ("clean, tested at strong", {"execution": "kinematic"}),

@@ -19,6 +19,7 @@ from imagine_bench.errors import ImagineBenchError, InvalidValueError, UnableErr
 from imagine_bench.exact.splits import split_of
 from imagine_bench.report.page import texts
 from imagine_bench.report.sweep import levels_csv, scores_csv, suite_page
+from imagine_bench.running.bench import load_bench
 from imagine_bench.store.bench_folder import read_control
 from imagine_bench.sweep import grid
 from imagine_bench.sweep.grid import GRIDS, SUITE, Experiment, Level, Suite
@@ -53,8 +54,13 @@ TINY = Suite(
 
 
 @pytest.fixture(scope="module")
-def result(tmp_path_factory):
-    return run_suite(TINY, ("random", "oracle", "table"), root=tmp_path_factory.mktemp("runs"), launcher=Inline())
+def root(tmp_path_factory):
+    return tmp_path_factory.mktemp("runs")
+
+
+@pytest.fixture(scope="module")
+def result(root):
+    return run_suite(TINY, ("random", "oracle", "table"), root=root, launcher=Inline())
 
 
 def _without_times(text):
@@ -89,12 +95,18 @@ def test_rows_name_the_seeds_of_their_benches(tmp_path):
     rows = list(csv.DictReader(io.StringIO(levels_csv(found))))
     runs = {row["seed"]: read_control(tmp_path / row["bench"]).seeds for row in rows}
     assert runs == {"0": (0,), "1": (1,)}
+    (level,) = found.levels["size", "random"]
+    costly = {("size", "random"): (dataclasses.replace(level, train_cpu_s=12.34),)}
+    rows = csv.DictReader(io.StringIO(levels_csv(dataclasses.replace(found, levels=costly))))
+    assert {(row["task"], row["cpu_s"]) for row in rows} == {("arrows", "12.3")}
 
 
-def test_experiments_share_a_level(result):
+def test_experiments_share_a_level(result, root):
     (size,) = result.levels["size", "table"]
     stochasticity, _ = result.levels["stochasticity", "table"]
     assert size.benches == stochasticity.benches and np.array_equal(size.values, stochasticity.values)
+    rows = [run.checkpoints[-1] for bench in size.benches for run in load_bench(root / bench).runs]
+    assert size.train_cpu_s == np.mean([row.train_cpu_s for row in rows]) > 0.0 and len(rows) == 2
     (uncertainty,) = result.levels["uncertainty", "table"]
     assert set(uncertainty.benches).isdisjoint(size.benches)
 
@@ -186,19 +198,20 @@ def test_separating_names_its_agents_and_hides_the_changed_rule():
         assert len(others) == 2 and planned.seeds == (400,) and planned.budgets[-1] == level.episodes
     told = [plan_level(separating, by_name["changed_rule"][0], agent)[0][0] for agent in ("dqn", "random")]
     assert [(each.after, each.unannounced) for each in told] == [(("arrow_puzzle",), True), ((), False)]
-
-
-def test_no_learner_is_scored_without_the_unannounced_change():
-    changed = {each.name: each.levels for each in GRIDS["separating"].experiments}["changed_rule"][0]
     with pytest.raises(UnableError, match=r"'sb3_dqn' .*, or that agent"):
-        plan_level(GRIDS["separating"], changed, "sb3_dqn")
+        plan_level(separating, by_name["changed_rule"][0], "sb3_dqn")
 
 
 def test_who_cannot_carry_over_starts_anew():
+    """With all else as the suite says."""
     level = TINY.experiments[2].levels[0]
-    (alone, _), *_ = plan_level(TINY, level, "table")
-    (carried, _), *_ = plan_level(TINY, level, "factored:given")
-    assert (alone.after, carried.after) == ((), ("arrow_puzzle",))
+    suite = dataclasses.replace(TINY, seeds=(3, 5), execution="physics")
+    of_suite = {name: getattr(suite, name) for name in ("execution", "evaluation_episodes", "hyperparameters")}
+    for agent, after in (("table", ()), ("factored:given", ("arrow_puzzle",))):
+        planned = [each for each, _ in plan_level(suite, level, agent)]
+        assert [(each.seeds, each.after) for each in planned] == [((3,), after), ((5,), after)]
+        wanted = {**of_suite, "budgets": (5,), "open_loop_starts": 0, "recorded_episodes": 0}
+        assert all(vars(each).items() >= wanted.items() for each in planned)
 
 
 def test_a_level_keeps_the_world_that_a_file_described(tmp_path):
@@ -210,12 +223,6 @@ def test_a_level_keeps_the_world_that_a_file_described(tmp_path):
         made.append(Suite(name="own", experiments=(Experiment(name="a", parameter="p", question="?", levels=levels),)))
     assert [each.experiments[0].levels[0].task for each in made] == ["arrows:cubes=1", "arrows:cubes=2"]
     assert made[0].hash != made[1].hash
-
-
-def test_a_level_with_a_wrong_earlier_task_is_no_level_without_one():
-    level = Level(name="4", task="arrows:cubes=4", protocol={"after": ("arrow_puzzle",)})
-    with pytest.raises(InvalidValueError, match="cannot come after arrow_puzzle"):
-        plan_level(TINY, level, "table")
 
 
 def test_settings_of_physics_are_a_table_in_a_level():
@@ -234,11 +241,15 @@ def test_settings_of_physics_are_a_table_in_a_level():
         ({"evaluation_episodes": 5}, "No field that a level may change 'evaluation_episodes'"),
         ({"seeds": (3, 4)}, "No field that a level may change 'seeds'"),
         ({"budgets": (10, 20)}, "Level '3' has 250 episodes; give budgets that end there"),
+        ({"after": ("pick_place",)}, "cannot come after pick_place"),
+        ({}, r"its levels \['3'\] have no rollouts to measure"),
     ],
 )
 def test_a_level_that_its_scores_would_misstate_is_refused(fields, sentence):
     with pytest.raises(ImagineBenchError, match=sentence):
-        Level(name="3", task="arrows", protocol=fields)
+        level = Level(name="3", task="arrows", protocol=fields)
+        plan_level(TINY, level, "table")
+        Experiment(name="uncertainty", parameter="episodes", question="?", measure="auroc", levels=(level,))
 
 
 @pytest.mark.parametrize("seeds", [(), (1, 1), (-1,), (0, 1000), tuple(range(1200))])
@@ -248,9 +259,3 @@ def test_seeds_that_no_bench_takes_are_refused_by_a_suite_in_a_sentence(seeds):
         dataclasses.replace(TINY, seeds=seeds)
     assert len(str(refused.value)) < 300
     assert dataclasses.replace(TINY, seeds=(3, 0, 2)).seeds == (0, 2, 3)
-
-
-def test_auroc_without_imagined_rollouts_is_refused():
-    silent = Level(name="5", task="arrows", episodes=5)
-    with pytest.raises(InvalidValueError, match=r"its levels \['5'\] have no rollouts to measure"):
-        Experiment(name="uncertainty", parameter="episodes", question="?", measure="auroc", levels=(silent,))

@@ -19,8 +19,8 @@ from imagine_bench.store.results import KeptEpisodes
 Forge = Callable[[Path, np.random.Generator], None]
 
 
-def forged(honest: Path, root: Path, forge: Callable[[Path], object]) -> Path:
-    """A copy of a bench that somebody has forged."""
+def forged(honest: Path, root: Path, forge: Callable[[Path], object] = lambda folder: None) -> Path:
+    """A copy of a bench that somebody has forged, or that is to be."""
     folder = root / honest.name
     shutil.copytree(honest, folder)
     forge(folder)

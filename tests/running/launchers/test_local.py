@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
 import subprocess
@@ -18,7 +19,7 @@ from small_runs import small
 from imagine_bench.cores import usable_cores, usable_memory
 from imagine_bench.protocols.data import Job, Progress
 from imagine_bench.running.isolation import Limits
-from imagine_bench.running.launchers.jobs import LocalPool, at_a_time, work_through
+from imagine_bench.running.launchers.jobs import LocalPool, at_a_time, launcher, work_through
 from imagine_bench.store import run_folder
 
 _HERE = Path(__file__).parents[2] / "fakes"
@@ -29,15 +30,19 @@ def job(root: Path, agent: str, seed: int, **changes: object) -> Job:
     return Job(spec=spec, folder=root / agent / f"seed_{seed}")
 
 
-def test_a_failed_run_is_named_and_stops_no_other(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["local", "this_process"])
+def test_a_failed_run_is_named_and_stops_no_other(name: str, tmp_path: Path) -> None:
+    """Runs of other packages have a process each."""
     jobs = [job(tmp_path, "failing", 1), job(tmp_path, "failing", 0)]
     told: list[Progress] = []
-    (failure,) = LocalPool(1).launch(jobs, told.append)
+    (failure,) = launcher(name, 1).launch(jobs, told.append)
+    processes = {(each.folder / ".lock.holder").read_text() for each in jobs}
+    assert len(processes) == (2 if name == "local" else 1)
     assert failure.job is jobs[0]
     assert failure.reason == "RuntimeError: this agent breaks on purpose"
     log = failure.job.log.read_text()
     assert "failing seed 1 begins or goes on" in log and "Traceback" in log and "breaks on purpose" in log
-    assert r"\x1b[31mred" in log and "\x1b" not in log
+    assert (r"\x1b[31mred" in log) == (name == "local") and "\x1b" not in log
     assert not run_folder.is_done(jobs[0].folder) and run_folder.is_done(jobs[1].folder)
     assert [progress.seed for progress in told if progress.phase == "done"] == [0]
     assert [(progress.seed, progress.detail) for progress in told if progress.phase == "failed"] == [
@@ -123,6 +128,24 @@ def test_a_worker_that_dies_costs_one_item() -> None:
     assert workers[0] == workers[1] and workers[2] == workers[4], "one process after another item"
     assert len(set(workers)) == 3, "a death costs a process, and item 3 has its own"
     assert psutil.wait_procs([child for child in psutil.Process().children() if child.pid in workers], 10)[1] == []
+
+
+def _met(folder: Path, item: int, tell: Callable[[int], None]) -> str:
+    """Wait for the process that carries out the other item."""
+    (folder / str(item)).touch()
+    until_s = time.monotonic() + 30
+    while not (folder / str(1 - item)).exists():
+        if time.monotonic() > until_s:
+            return "it is alone"
+        time.sleep(0.02)
+    return ""
+
+
+def test_as_many_items_are_carried_out_at_once_as_there_are_workers(tmp_path: Path) -> None:
+    ends: list[str] = []
+    carry = functools.partial(_met, tmp_path)
+    work_through(carry, range(2), workers=2, on_news=lambda _: None, on_end=lambda _, why: ends.append(why))
+    assert ends == ["", ""]
 
 
 _OLD_CPU = "cpu,cpuacct/x/cpu.cfs"

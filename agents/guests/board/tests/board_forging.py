@@ -44,11 +44,16 @@ def with_round(bench: Path, board: Path, secret: Path) -> None:
     submit(bench, board / "rows", author="a founder", round_folder=folder, encoder=None)
 
 
+def submitted(run: Path, rows: Path) -> list[Path]:
+    """The rows of a run or a bench, with open starts."""
+    return submit(run, rows, author="a founder", round_folder=None, encoder=None)
+
+
 def honest_board(root: Path) -> Path:
     """A board of the rows of a bench, with open starts and with those of a round."""
     bench, _ = shared_bench()
     board = root / "board"
-    submit(bench, board / "rows", author="a founder", round_folder=None, encoder=None)
+    submitted(bench, board / "rows")
     with_round(bench, board, root / "secret.json")
     return board
 

@@ -9,23 +9,22 @@ from pathlib import Path
 
 import bench_fakes  # noqa: F401 - registers its agents
 import pytest
-from board_forging import AFTER, BEFORE, CLOSES, ROUND, TESTS, on, with_round
+from board_forging import AFTER, BEFORE, CLOSES, ROUND, TESTS, on, submitted, with_round
 from imagine_bench_board import rounds
 from imagine_bench_board.check import check
 from imagine_bench_board.rows import NAME, read_row, row_name
 from imagine_bench_board.submit import file_agents, submit
-from small_runs import Inline, small
+from small_runs import made_bench, small
 
 from imagine_bench import registry
 from imagine_bench.cli import exit_code
 from imagine_bench.errors import ArtefactError, InvalidValueError
-from imagine_bench.running.bench import bench
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     wanted = small(agents=("table",), seeds=(0, 1))
-    return bench(wanted, {}, root=tmp_path_factory.mktemp("bench"), launcher=Inline()).folder
+    return made_bench(wanted, tmp_path_factory.mktemp("bench")).folder
 
 
 def opened(tmp_path: Path) -> tuple[Path, Path]:
@@ -44,7 +43,7 @@ def test_a_round_from_promise_to_rows(finished: Path, tmp_path: Path) -> None:
     assert found.verdict.episodes == 2 * TESTS
     seed = json.loads((tmp_path / "secret.json").read_text())["seed"]
     assert json.loads((board / "rounds/winter/revealed.json").read_text())["seed"] == seed
-    (other,) = submit(finished, tmp_path / "open", author="", round_folder=None, encoder=None)
+    (other,) = submitted(finished, tmp_path / "open")
     own = read_row(next((board / "rows").iterdir()))
     fingerprints = own.kept(0).fingerprints.tolist()
     assert not set(fingerprints) & set(read_row(other).kept(1).fingerprints.tolist())
@@ -96,8 +95,6 @@ def test_days_decide_what_may_be_done(finished: Path, tmp_path: Path) -> None:
         file_agents(finished, folder)
         with pytest.raises(InvalidValueError, match="these agents are filed already"):
             file_agents(finished, folder)
-    with pytest.raises(ArtefactError, match=r"There is no .*revealed\.json"):
-        submit(finished, tmp_path / "rows", author="", round_folder=folder, encoder=None)
 
 
 def test_all_that_can_be_wrong_with_a_row_is_said_before_its_tests_are_played(finished: Path, tmp_path: Path) -> None:

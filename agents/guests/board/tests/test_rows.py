@@ -12,14 +12,13 @@ from typing import Any
 
 import bench_fakes  # noqa: F401 - registers its agents
 import pytest
-from board_forging import OpenRow
+from board_forging import OpenRow, submitted
 from imagine_bench_board import submit as submitting
 from imagine_bench_board.check import NEVER_SHOWN, NOT_VOUCHED, check
-from imagine_bench_board.page import write_board
+from imagine_bench_board.page import board_page, write_board
 from imagine_bench_board.rows import CARD, EPISODES, LARGEST, LONGEST, read_row, world_words
-from imagine_bench_board.submit import submit
 from report_pages import in_words
-from small_runs import QUICK, Inline, small
+from small_runs import QUICK, Inline, made_bench, small, written
 from whole_outputs import expected_of
 
 from imagine_bench.cli import exit_code
@@ -27,6 +26,7 @@ from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.exact.certificate import certificate
 from imagine_bench.report.page import percent
 from imagine_bench.running.bench import bench, plan
+from imagine_bench.running.player import played_run, protocol_of_player
 from imagine_bench.seeding import TUNING_SEEDS
 from imagine_bench.store.bench_folder import bench_facts
 from imagine_bench.store.run_folder import load_run
@@ -35,14 +35,14 @@ from imagine_bench.store.run_folder import load_run
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run of a small bench of two agents."""
-    wanted = small(agents=("table", "random"), seeds=(0, 1), evaluation_episodes=6)
-    result = bench(wanted, {}, root=tmp_path_factory.mktemp("bench"), launcher=Inline())
+    wanted = small(agents=("table", "random"), seeds=(0, 1), few_seeds={"random": 1}, evaluation_episodes=6)
+    result = made_bench(wanted, tmp_path_factory.mktemp("bench"))
     return result.runs[0].folder
 
 
 @pytest.fixture
 def row(run: Path, tmp_path: Path) -> Path:
-    (folder,) = submit(run, tmp_path / "board" / "rows", author="a founder", round_folder=None, encoder=None)
+    (folder,) = submitted(run, tmp_path / "board" / "rows")
     return folder
 
 
@@ -55,23 +55,26 @@ def test_a_run_is_submitted_with_all_seeds_and_budgets(
     assert read.checkpoint(3) == dataclasses.replace(kept, eval_cpu_s=0.0, diagnostics={}, open_loop=None)
     assert [read.kept(3).actions_of(test) for test in range(6)] == [kept.kept.actions_of(test) for test in range(6)]
     assert read.claimed.agent == "table" and read.claimed.author == "a founder"
+    made = bench_facts(run.parents[1])["environment"]
+    assert (read.claimed.commit, read.claimed.machine) == (str(made["commit"]), made["machine"]["cpu"])
     assert {each.agent_sha256 for each in read.claimed.prices} != {""}
     for place, there in (("here", Path()), ("beside", Path("..") / run.name)):
         monkeypatch.chdir(run)
-        (again,) = submit(there, tmp_path / place, author="a founder", round_folder=None, encoder=None)
+        (again,) = submitted(there, tmp_path / place)
         assert read_row(again) == read, place
         monkeypatch.chdir(again)
         assert exit_code(["board", "check", "."]) == 0
 
 
 def test_a_bench_is_submitted_agent_by_agent(run: Path, tmp_path: Path) -> None:
-    written = submit(run.parents[1], tmp_path, author="", round_folder=None, encoder=None)
-    assert [read_row(folder).claimed.agent for folder in written] == ["table", "random"]
+    written = submitted(run.parents[1], tmp_path)
+    seeds = {row.claimed.agent: row.protocol.seeds for row in map(read_row, written)}
+    assert seeds == {"table": (0, 1), "random": (0,)}
     with pytest.raises(InvalidValueError, match="exists; remove it, or give another folder to --out"):
-        submit(run, tmp_path, author="", round_folder=None, encoder=None)
+        submitted(run, tmp_path)
     shutil.rmtree(written[0])
     with pytest.raises(InvalidValueError, match=f"{written[1].name} exists"):
-        submit(run.parents[1], tmp_path, author="", round_folder=None, encoder=None)
+        submitted(run.parents[1], tmp_path)
     assert list(tmp_path.iterdir()) == written[1:], "none is written unless all can be"
 
 
@@ -95,6 +98,7 @@ def test_a_page_that_cannot_be_written_is_said_before_the_check(
             None,
             "3 episodes of arrow_puzzle_hard",
         ),
+        ({"appearance": "mild", "dataset": 6}, None, "dataset mixed-6@"),
         ({"agents": ("oracle",)}, 0, "privileged: true macrostates"),
         ({"agents": ("dqn",)}, 24_000, "encoder arrow_puzzle-clean@"),
     ],
@@ -103,8 +107,10 @@ def test_all_that_was_seen_beforehand_is_said(
     tmp_path: Path, changes: dict[str, Any], frames: int | None, seen: str
 ) -> None:
     few = {"agents": ("table",), "budgets": (3,), "evaluation_episodes": 1, "seeds": (0,), **QUICK}
+    if "dataset" in changes:
+        changes = {**changes, "dataset": written(tmp_path / "set", episodes=changes["dataset"]).folder}
     done = bench(*plan("arrow_puzzle", "smoke", **{**few, **changes}), root=tmp_path / "bench", launcher=Inline())
-    folder, *_ = submit(done.folder, tmp_path / "rows", author="", round_folder=None, encoder=None)
+    folder, *_ = submitted(done.folder, tmp_path / "rows")
     claimed = read_row(folder).claimed
     assert claimed.frames_beforehand == frames and claimed.seen_beforehand.startswith(seen)
 
@@ -123,20 +129,32 @@ def test_rows_of_unlike_tests_stand_in_tables_of_their_own() -> None:
 def test_the_tests_of_tuning_seeds_are_told_from_those_of_others(tmp_path: Path) -> None:
     for seed in (3, TUNING_SEEDS + 3):
         wanted = small(agents=("random",), seeds=(seed,), evaluation_episodes=2)
-        folder = bench(wanted, {}, root=tmp_path, launcher=Inline()).folder
-        submit(folder, tmp_path / "rows", author="", round_folder=None, encoder=None)
+        folder = made_bench(wanted, tmp_path).folder
+        submitted(folder, tmp_path / "rows")
     found = {each.row.protocol.seeds[0]: each.row.starts for each in check(tmp_path) if each.row is not None}
     assert found == {3: "open starts", TUNING_SEEDS + 3: "tuning starts"}
 
 
 def test_the_chance_beside_a_split_is_that_of_its_tests(tmp_path: Path) -> None:
     wanted = small(split="plan_length=2", agents=("random",), evaluation_episodes=2)
-    folder = bench(wanted, {}, root=tmp_path, launcher=Inline()).folder
-    submit(folder, tmp_path / "rows", author="", round_folder=None, encoder=None)
+    folder = made_bench(wanted, tmp_path).folder
+    submitted(folder, tmp_path / "rows")
     page = write_board(check(tmp_path), tmp_path / "page").read_text()
     exact = certificate(wanted.spec(testing=True)).chance_level
     assert f"Chance solves {percent(exact)} % of its episodes" in in_words(page)
     assert percent(exact) != percent(wanted.spec(testing=False).facts().chance_level)
+
+
+@pytest.mark.parametrize("training", [None, 1])
+def test_the_row_of_a_person_is_one(tmp_path: Path, training: int | None) -> None:
+    wanted = protocol_of_player("arrow_puzzle", "person", "anna", tests=1, training=training, execution="kinematic")
+    with played_run(wanted, tmp_path) as run:
+        while not run.is_done:
+            run.reset()
+            run.step(0)
+    submitted(run.folder, tmp_path / "rows")
+    page = write_board(check(tmp_path), tmp_path / "page").read_text()
+    assert "person:anna" in page and "no person has played here yet" not in page
 
 
 def test_a_long_command_is_cut(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -145,7 +163,7 @@ def test_a_long_command_is_cut(run: Path, tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(
         submitting, "bench_facts", lambda _: {"environment": {**facts["environment"], "command": command}}
     )
-    (folder,) = submit(run, tmp_path, author="", round_folder=None, encoder=None)
+    (folder,) = submitted(run, tmp_path)
     claimed = read_row(folder).claimed.command
     assert claimed.startswith("imagine-bench bench  --set a=1 a=1") and len(claimed) == LONGEST
 
@@ -290,6 +308,19 @@ def test_every_number_of_the_page_leads_to_its_episodes(row: Path, tmp_path: Pat
         assert f"<td>{test}</td><td>{start}</td><td>{actions}</td>" in linked
     assert "no person has played here yet" in text
     assert (page.parent / "board.csv").read_text().count("\n") == 1 + 4
+
+
+def test_rows_of_one_player_have_a_curve_each_and_their_mean_cost(row: Path) -> None:
+    shutil.copytree(row, row.with_name("a_copy"))
+    opened = OpenRow(row)
+    for price, cpu_s in zip(opened.card["claimed"]["prices"], (10.0, 20.0, 30.0, 60.0), strict=True):
+        price["train_cpu_s"] = cpu_s
+    opened.write()
+    section, *_ = board_page(check(row.parents[1])).sections
+    draw = section.images[0].draw
+    assert draw is not None and [line.get_label() for line in draw().axes[0].lines] == ["table", row.name]
+    cells = dict(zip(section.tables[0].header, zip(*section.tables[0].rows, strict=True), strict=True))
+    assert cells["CPU s (claimed)"][1] == "40.0", "of two seeds after 9 episodes"
 
 
 def test_a_row_of_another_folder_is_not_read_as_one(tmp_path: Path) -> None:

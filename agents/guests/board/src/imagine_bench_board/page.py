@@ -133,7 +133,7 @@ def _section(world: str, rows: Sequence[Row]) -> Section:
     """The table and the curve of a world."""
     best_first = sorted(rows, key=lambda row: -float(np.mean(_success(row, row.protocol.budgets[-1]))))
     cells = [_cells(row) for row in best_first]
-    if not any(row.claimed.agent.startswith(_PERSON) for row in rows):
+    if not any(row.claimed.agent.removeprefix("trained_").startswith(f"{_PERSON}:") for row in rows):
         cells.append({**dict.fromkeys(cells[0], DASH), "player (claimed)": f"{_PERSON}: {_NOBODY}"})
     facts = rows[0].protocol.spec(testing=True).facts()
     words = [
