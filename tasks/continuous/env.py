@@ -272,7 +272,7 @@ class MotionEnv(SceneEnv):
             InvalidValueError: As :meth:`step`; then nothing has moved.
         """
         self._require_begun()
-        periods_left = max(0.0, self.time_limit_s / self.period_s - self.episode.periods)
+        periods_left = max(0.0, self.time_limit_s / self.period_s - 0.5 - self.episode.periods)
         actions = actions[: math.ceil(min(periods_left, len(actions)))]
         before = self.data.ctrl[self.columns.ctrl]
         commands = []

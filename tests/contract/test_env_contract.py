@@ -353,6 +353,9 @@ def test_the_motion_describes_the_scene():
     still = env.motion()
     shapes = env.shapes()
     assert {"right_l3"} <= {shape.body for shape in shapes} <= set(still.body_names)
+    env.world.hide_gesture(True)
+    assert "hand" in {shape.body for shape in env.shapes()}
+    assert [shape.rgba.tolist() for shape in env.shapes()] == [[*shape.rgba[:3], 1.0] for shape in shapes], "and people"
     assert all(shape.faces is None or shape.faces.max() < len(shape.vertices) for shape in shapes)
     for name, pose in zip(still.body_names, still.poses_in_world[0], strict=True):
         matrix = np.empty(9)

@@ -172,6 +172,18 @@ def test_a_joint_that_runs_away_to_either_side_is_noticed(world, sign):
     assert found == [False, True]
 
 
+def test_bad_positions_speeds_and_accelerations_are_explosions(world):
+    """MuJoCo warns of them and resets the data by itself; its other warnings are of small matters."""
+    warnings = mujoco.mjtWarning
+    found = set()
+    for which in range(warnings.mjNWARNING.value):
+        place(world)
+        world.data.warning.number[which] = 1
+        found |= {warnings(which)} if blew_up(world.data) else set()
+        world.data.warning.number[which] = 0
+    assert found == {warnings.mjWARN_BADQPOS, warnings.mjWARN_BADQVEL, warnings.mjWARN_BADQACC}
+
+
 def explode(world, said):
     world.data.qpos[world.object_qpos[2]] = [1e11, 0, 0, 1, 0, 0, 0]
     with pytest.raises(DivergedError, match=f"its start state and controls {said}"):

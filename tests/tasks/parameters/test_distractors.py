@@ -89,13 +89,20 @@ def test_balls_are_anywhere_on_the_screen_equally_often():
     distractors.add_distractors(spec, 4)
     model = spec.compile()
     data, rng, what = mujoco.MjData(model), np.random.default_rng(0), distractors.Distraction(model, 4)
+    low_m = np.array(distractors.LOW_M) + distractors.RADIUS_M
+    wide_m = np.array(distractors.HIGH_M) - distractors.RADIUS_M - low_m
+    starts_m = []
+    of_starts = np.random.default_rng(1)
+    for _ in range(1000):
+        what.place(data, of_starts)
+        starts_m.append(data.mocap_pos[:, :2].ravel().copy())
+    together = np.corrcoef(np.array(starts_m).T)
+    assert np.abs(together[~np.eye(len(together), dtype=bool)]).max() < 0.12, "each ball has a place of its own"
     what.place(data, rng)
     middles_m = []
     for _ in range(6000):
         what.vary(data, rng)
         middles_m.extend(data.mocap_pos[:, :2].copy())
-    low_m = np.array(distractors.LOW_M) + distractors.RADIUS_M
-    wide_m = np.array(distractors.HIGH_M) - distractors.RADIUS_M - low_m
     for share in (np.array(middles_m) - low_m).T / wide_m[:, None]:
         assert stats.kstest(share, "uniform").statistic < 0.02
         assert (np.minimum(share, 1.0 - share) < 0.01).mean() == pytest.approx(0.02, rel=0.25)

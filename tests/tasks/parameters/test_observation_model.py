@@ -165,6 +165,11 @@ def test_frames_of_macrostates_hide_what_the_environment_hides():
         np.testing.assert_array_equal(env.agent_view(), frame)
         again = spec.render_macrostates(np.array([like]), "clean", np.random.default_rng(2))[0]
         assert not np.array_equal(again, frame)
+        both, seen = (
+            spec.render_macrostates(np.array(batch), "clean", np.random.default_rng(2))
+            for batch in ([hidden[0], like, hidden[0]], [like] * 3)
+        )
+        assert [np.array_equal(*pair) for pair in zip(both, seen, strict=True)] == [False, True, False]
         assert (shown_states(spec)[:, -1] == -1).any() and classes_of(spec)[-1] == len(spec.macrostate_values[-1]) + 1
         assert spec.value_names(hidden[0])[-1] == "not seen" and spec.encoder.endswith("_hidden")
 
