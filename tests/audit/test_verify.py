@@ -15,7 +15,7 @@ from forger import FORGERIES, IN_TRAINING, forged, share_weights
 from forging import OpenRun, of_second, oracle, rewrite_protocol
 from guest_packages import Guests
 from kinds import take_row
-from small_runs import Inline, collected, made_bench, small
+from small_runs import Inline, benched, collected, made_bench, small
 
 from imagine_bench import registry
 from imagine_bench.data.folder import write_dataset
@@ -32,6 +32,7 @@ from imagine_bench.running.evaluation import EvaluationCounts, play_test_episode
 from imagine_bench.running.retraining import Retraining
 from imagine_bench.running.run_state import environments
 from imagine_bench.seeding import episode_seed
+from imagine_bench.store import encoders
 from imagine_bench.store.files import read_sealed, sealed
 from imagine_bench.tools.audits import verify, what_is_shown, with_report
 
@@ -248,6 +249,7 @@ def test_claims_of_training_follow_from_its_macro_actions(pair: Path, tmp_path: 
         ({"settings_digest": "0123456789ab"}, "and the file says '0123456789ab'"),
         ({"encoder": "other@0123456789ab"}, "it names the encoder other@0123456789ab, and no agent reads latents"),
         ({"codes": "other@0123456789ab"}, "it names the encoder other@0123456789ab, and no agent reads codes"),
+        ({"encoder": "other@0123456789ab", "codes": "other@0123456789ab"}, "and no agent reads latents"),
     ],
 )
 def test_what_a_protocol_says_follows_from_its_runs(
@@ -255,6 +257,15 @@ def test_what_a_protocol_says_follows_from_its_runs(
 ) -> None:
     folder = rewrite_protocol(forged(pair, tmp_path), **claim)
     assert complaint in " ".join(each.complaint for each in verify(folder))
+
+
+@pytest.mark.parametrize("agents", [("dqn",), ("factored:given",), ("dqn", "factored:given")])
+def test_a_bench_that_was_given_codes_holds_whatever_its_agents_read(agents: tuple[str, ...], tmp_path: Path) -> None:
+    """An encoder of codes is also the encoder of agents that read latents, such as ``dqn``."""
+    few = {"budgets": (1,), "evaluation_episodes": 1}
+    codes = str(encoders.bundled()["arrow_puzzle-clean-codes"])
+    result = benched(tmp_path, "arrow_puzzle", *agents, encoder=codes, **few)
+    assert [each.complaint for each in verify(result.folder)] == [""] * (len(agents) + 1)
 
 
 class Lasting(Wrapper):

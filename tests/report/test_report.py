@@ -140,6 +140,24 @@ def test_verdicts(many: BenchResult, result: BenchResult, headed: BenchResult, e
     assert re.match(r"imagination: \S+ points at 6,000 against dqn, undecided with 3 seeds; ", first)
 
 
+@pytest.mark.parametrize(("sign", "word"), [(1, "better"), (-1, "worse")])
+@pytest.mark.parametrize(("least", "p"), [(16, "p < .05"), (28, "p < .01"), (60, "p < .001")])
+@pytest.mark.parametrize("budget", [250, 2000, 6000])
+def test_a_verdict_on_several_budgets_claims_no_more_than_holds_at_each_of_them(
+    many: BenchResult, sign: int, word: str, least: int, p: str, budget: int
+) -> None:
+    """Successes of 200 differ by the least number at one budget, and by 60 at the two others."""
+    base = [90, 92, 95, 100, 105, 108, 110]
+
+    def change(run: RunResult, row: Checkpoint) -> Checkpoint:
+        more = sign * (least if row.episodes == budget else 60)
+        given = {"dqn": 0, "imagination": more}.get(run.agent)
+        place = many.protocol.seeds.index(run.seed)
+        return row if given is None else dataclasses.replace(row, successes=base[place] + given)
+
+    assert f"imagination: {word} than dqn at 250, 2,000 and 6,000 ({p})." in verdict(collect(rewritten(many, change)))
+
+
 def test_one_seed_hides_no_difference_of_others(many: BenchResult) -> None:
     first = collect(many).compared[0]
     protocol = dataclasses.replace(many.protocol, few_seeds=((first, many.protocol.seeds[0]),))

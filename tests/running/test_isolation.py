@@ -73,6 +73,25 @@ def test_a_guest_finds_nothing_of_its_caller(start: Start, tmp_path: Path, close
     assert tried["failed"] and tried["names"].tolist() == []
 
 
+def test_only_a_forbidden_module_and_those_below_it_are_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not others whose names begin or end alike, such as another package beside the package of a task."""
+    allowed = ("grid_world_tools", "grid_world2.rules", "small.grid_world", "grid")
+    forbidden = ("grid_world", "grid_world.rules", "grid_world.rules.exact", "games.grid", "games.grid.rules")
+    beside = ("games", "games.grid_tools")
+    for name in (*allowed, *forbidden, *beside):
+        folder = tmp_path / name.replace(".", "/")
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "__init__.py").touch()
+    monkeypatch.syspath_prepend(tmp_path)
+    closed = ["grid_world", "games.grid"]
+    with Isolated("hostile_guest:Hostile", log=tmp_path / "log.txt", forbidden=closed, closed=False) as guest:
+        for name in forbidden:
+            with pytest.raises(GuestError, match="is closed to code that is judged"):
+                guest.call("imported", name)
+        for name in (*allowed, *beside):
+            assert guest.call("imported", name) == {}
+
+
 _ENDS = [
     ("exits", (0,), "SystemExit: 0"),
     ("dies", (0,), "ended itself with exit code 0"),

@@ -8,12 +8,14 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import psutil
 import pytest
-from small_runs import same_but_for_time
+from small_runs import same_but_for_time, small
 
 from imagine_bench import registry
 from imagine_bench.errors import SetupError
@@ -134,15 +136,74 @@ def test_a_node_and_a_worker_killed_in_the_middle_cost_no_result(
     assert same_results(tmp_path, "ray", few)
 
 
-@needs_ray
-def test_the_news_of_two_benches_do_not_hide_each_other() -> None:
-    from imagine_bench.running.launchers.ray import _Board
+class Sent:
+    """The result of a task, or of a method of an actor, which is there at once."""
 
-    board = _Board()
-    news = [Progress(agent="dqn", seed=0, bench=each, phase="done", done=1, work=1) for each in ("one", "other")]
-    for each in news:
-        board.put(each)
-    assert board.take() == news and board.take() == []
+    def __init__(self, function: Callable[..., object], *given: object) -> None:
+        self.value = function(*given)
+
+
+class Remote:
+    """A function that runs in this process, or a class whose objects are here."""
+
+    def __init__(self, thing: Callable[..., object]) -> None:
+        self._thing = thing
+
+    def options(self, **options: object) -> Remote:
+        return self
+
+    def remote(self, *given: object) -> object:
+        return Actor(self._thing(*given)) if isinstance(self._thing, type) else Sent(self._thing, *given)
+
+
+class Actor:
+    """An object whose methods are called as those of one elsewhere."""
+
+    def __init__(self, held: object) -> None:
+        self._held = held
+
+    def __getattr__(self, name: str) -> Remote:
+        return Remote(getattr(self._held, name))
+
+
+@pytest.fixture
+def ray_here(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Ray need not be installed: tasks are carried out in this process when they are sent, before any news is taken."""
+    ray = mock.MagicMock()
+    ray.cluster_resources.return_value = {}
+    ray.get.side_effect = lambda sent: sent.value
+    ray.wait.side_effect = lambda tasks, timeout: (tasks, [])
+    ray.remote.side_effect = lambda *thing, **options: Remote(*thing) if thing else Remote
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.delitem(sys.modules, "imagine_bench.running.launchers.ray", raising=False)
+    for name, module in (("ray", ray), ("ray.actor", ray.actor)):
+        monkeypatch.setitem(sys.modules, name, module)
+    outputs = [os.dup(number) for number in (1, 2)]  # a task's output goes to the log of its run
+    yield
+    for number, output in enumerate(outputs, 1):
+        os.dup2(output, number)
+        os.close(output)
+    sys.modules.pop("imagine_bench.running.launchers.ray", None)
+
+
+@pytest.mark.usefixtures("ray_here")
+def test_the_end_of_every_run_of_several_benches_is_told_once(tmp_path: Path) -> None:
+    """The benches of a study have the same agents and seeds. One run cannot begin."""
+    benches = [small(agents=("random", "table"), seeds=(0, 1), evaluation_episodes=count) for count in (1, 2)]
+    every = [
+        Job(spec=RunSpec(protocol=bench, agent=agent, seed=seed), folder=tmp_path / bench.hash / f"{agent}_{seed}")
+        for bench in benches
+        for agent, seed in bench.runs
+    ]
+    every[0].folder.parent.mkdir()
+    every[0].folder.touch()  # a file stands where the run's folder should be
+    told: list[Progress] = []
+    failures = launcher("ray", 1).launch(every, told.append)
+    assert [failure.job for failure in failures] == every[:1]
+    runs = [(job.spec.protocol.hash, job.spec.agent, job.spec.seed) for job in every]
+    ended = {(each.bench, each.agent, each.seed): each.phase for each in told}
+    assert ended == dict(zip(runs, ["failed"] + ["done"] * 7, strict=True))
+    assert len(told) == len(runs), "no news is told twice"
 
 
 @needs_ray

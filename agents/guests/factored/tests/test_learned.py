@@ -281,20 +281,46 @@ def test_a_look_that_was_never_seen_is_unknown() -> None:
     assert known[~without][:, wheel].mean() < 0.1 and known[without].all(axis=1).mean() > 0.95
 
 
-def test_a_resumed_perception_is_renewed_as_soon_as_any() -> None:
-    """Sooner once something had no known value: from 16 frames on with 20 (1.25), and from these with 23 (1.125)."""
+def seeing_all(growth: float, growth_if_known: float) -> tuple[LearnedPerception, Frame]:
+    """A perception that found factors in 16 frames, and these frames."""
     _, frames = walk(16, np.random.default_rng(0))
-    settings = LearnedPerceptionSettings(growth=1.125, growth_if_known=1.25)
-    eyes, resumed = (LearnedPerception(settings, factored=True) for _ in range(2))
+    eyes = LearnedPerception(LearnedPerceptionSettings(growth=growth, growth_if_known=growth_if_known), factored=True)
     for begins, (before, after) in enumerate(pairwise(frames)):
         eyes.remember(before, 0, after, begins=not begins)
     eyes.look(len(eyes.frames))
+    return eyes, frames
+
+
+def test_a_resumed_perception_is_renewed_as_soon_as_any() -> None:
+    """Sooner once something had no known value: from 16 frames on with 20 (1.25), and from these with 23 (1.125)."""
+    eyes, frames = seeing_all(1.125, 1.25)
+    resumed, _ = seeing_all(1.125, 1.25)
     for count in range(17, 24):
         eyes.remember(eyes.frames[-1], 1, frames[count % 2] if count <= 20 else gray(1)[0])
         arrays = {**eyes.arrays(), "replay/action": np.array(eyes.actions)}
         resumed.load(AgentState(arrays=arrays, values=dict(eyes.values())))
         assert resumed.values() == eyes.values() and eyes.unknown == (count > 20)
         assert eyes.renew() == resumed.renew() == (count in (20, 23))
+
+
+@pytest.mark.parametrize(("unknown", "due"), [(None, 20), (17, 18), (18, 18), (19, 19)])
+def test_one_unknown_frame_is_not_forgotten_before_factors_are_found_anew(unknown: int | None, due: int) -> None:
+    """That frame may be any of the new ones: with it factors are found anew from 18 frames on (1.125), else with 20."""
+    eyes, frames = seeing_all(1.125, 1.25)
+    renewed = []
+    for count in range(17, 21):
+        eyes.remember(eyes.frames[-1], 1, gray(1)[0] if count == unknown else frames[count % 2])
+        if not renewed and eyes.renew():
+            renewed.append(count)
+    assert renewed == [due] and len(eyes.frames) == 20
+
+
+@pytest.mark.parametrize(("unknown", "anew"), [((), False), ((0,), True), ((1,), True), ((0, 1), True)])
+def test_each_of_two_frames_that_begin_an_episode_may_be_the_unknown_one(unknown: tuple[int, ...], anew: bool) -> None:
+    eyes, frames = seeing_all(1.125, 1.25)
+    before, after = (gray(1)[0] if place in unknown else frames[place] for place in range(2))
+    eyes.remember(before, 1, after, begins=True)
+    assert eyes.renew() == anew
 
 
 def test_shifted_and_dimmed_crops_are_alike_and_others_are_not() -> None:

@@ -15,7 +15,7 @@ from imagine_bench_factored.factors import CodeTransition
 from imagine_bench_factored.learned import LearnedPerceptionAgent
 from imagine_bench_factored.rewards import EXACT, reward_classes
 
-from imagine_bench.interfaces import AgentState
+from imagine_bench.interfaces import AgentState, Observation
 from imagine_bench.testing.checks import same_state
 
 RULED = ((-1.0, False), (-1.0, False), (-1.0, False), (-5.0, True), (-5.0, True), (50.0, True))
@@ -127,21 +127,48 @@ def live(learner: LearnedPerceptionAgent, episodes: range) -> None:
             learner.observe(replace(transition, reward=noisy), episode=episode)
 
 
+def live_drawn(learner: FactoredAgent, episode: int, *, noisy: bool) -> None:
+    """One episode of drawn macro-actions, whose rewards are exact or have a standard deviation of 0.5."""
+    rng = np.random.default_rng((0, episode))
+    learner.begin_episode()
+    for row in fake_codes.drawn(rng):
+        exact = fake_codes.transition(row.code, row.action)
+        noise = 0.5 * float(rng.standard_normal()) if noisy else 0.0
+        learner.observe(replace(exact, reward=exact.reward + noise), episode=episode)
+
+
+@pytest.mark.parametrize("begins", [0, 4])
+def test_rewards_that_more_data_shows_to_be_exact_are_learned_as_they_are(begins: int) -> None:
+    """Rewards of a task's first three episodes differ by chance, all later ones are exact, so no class stays.
+
+    So many episodes of another task were before. An agent that begins anew with all that was replayed has the same
+    values.
+    """
+    learner = fake_codes.agent()
+    for episode in range(begins):
+        live_drawn(learner, 100 + episode, noisy=False)
+    learner.reset_for_new_task()
+    had_classes = False
+    episode = 0
+    while not had_classes or learner.rewards is not EXACT:
+        assert episode < 30, "the rewards must have had classes, and then none"
+        live_drawn(learner, episode, noisy=episode < 3)
+        had_classes |= learner.rewards is not EXACT
+        episode += 1
+    state = learner.state()
+    assert state.arrays["replay/class_reward"].tolist() == [row.reward for row in learner.replay]
+    anew = fake_codes.agent()
+    anew.restore(state)
+    seen = [Observation(frame=fake_codes.frame(code)) for code in fake_codes.starts()]
+    assert [learner.q_values(each).tolist() for each in seen] == [anew.q_values(each).tolist() for each in seen]
+
+
 @pytest.mark.parametrize("begins", [0, 4])
 def test_a_resumed_run_classes_rewards_by_the_same_transitions(begins: int) -> None:
     """A restored agent knows which transitions of the present task had been classed.
 
     The task begins after so many episodes with exact rewards.
     """
-
-    def live_drawn(learner: FactoredAgent, episode: int) -> None:
-        rng = np.random.default_rng((0, episode))
-        learner.begin_episode()
-        for row in fake_codes.drawn(rng):
-            exact = fake_codes.transition(row.code, row.action)
-            noise = 0.5 * float(rng.standard_normal()) if episode >= begins else 0.0
-            learner.observe(replace(exact, reward=exact.reward + noise), episode=episode)
-
     learner = fake_codes.agent()
     resumptions = 0
     for episode in range(begins + 20):
@@ -149,11 +176,11 @@ def test_a_resumed_run_classes_rewards_by_the_same_transitions(begins: int) -> N
             learner.reset_for_new_task()
         state = learner.state()
         resumes = learner.rewards is not EXACT and learner.classed < len(learner.replay)
-        live_drawn(learner, episode)
+        live_drawn(learner, episode, noisy=episode >= begins)
         if resumes:
             resumed = fake_codes.agent()
             resumed.restore(state)
-            live_drawn(resumed, episode)
+            live_drawn(resumed, episode, noisy=episode >= begins)
             assert same_state(learner.state(), resumed.state())
             resumptions += 1
     assert resumptions > 5

@@ -88,6 +88,27 @@ def test_a_hostile_program_gets_one_sentence(source: str, said: str, tmp_path: P
     assert sentence.startswith(f"Program {file}: ") and said in sentence and "\n" not in sentence
 
 
+def test_each_factor_has_its_own_symbols_from_0_to_its_size(tmp_path: Path) -> None:
+    """The program changes the factor that the first symbol names to the value that the second one names."""
+    file = tmp_path / "changes.py"
+    file.write_text(
+        "def outcomes(symbols, action):\n"
+        "    place, value = symbols[:2]\n"
+        "    return {(*symbols[:place], (-1, 0, 2, 3, 4)[value], *symbols[place + 1 :]): 1.0}\n"
+    )
+    sizes = (4, 5, 3, 4)
+    changes = Program(str(file), sizes, 1)
+    for place, size in enumerate(sizes):
+        for number, value in enumerate((-1, 0, 2, 3, 4)):
+            state = (place, number, 0, 0, 0)
+            if 0 <= value < size:
+                (outcome,) = changes.outcomes(state, 0)
+                assert outcome.macrostate[place] == value
+            else:
+                with pytest.raises(InvalidValueError, match=re.escape(f"symbols lie below {sizes}.")):
+                    changes.outcomes(state, 0)
+
+
 @pytest.fixture
 def mine(tmp_path: Path) -> Path:
     """A copy of the example."""
