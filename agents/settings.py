@@ -45,6 +45,7 @@ def between(low: float, high: float, why: str = "") -> Range:
 Allowed = Range | tuple[str, ...]
 """The values that a setting may have: a range, or words."""
 PROBABILITY = between(0.0, 1.0)
+INSIDE = Range(lambda value: 0.0 < value < 1.0, "must lie between 0 and 1")
 RATE = Range(lambda value: 0.0 < value <= 1.0, "must lie in (0, 1]")
 POSITIVE = Range(lambda value: 0.0 < value <= 1e6, "must be above 0 and at most 1e+06")
 NOT_NEGATIVE = between(0.0, 1e6)

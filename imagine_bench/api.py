@@ -362,7 +362,7 @@ def _name(agent: str | MakeAgent) -> str:
     made_by = {name: entry.make for name, entry in registry.AGENTS.items() if isinstance(entry.make, CodeByValue)}
     same = [name for name, make in made_by.items() if make == code]
     former = [name for name, make in made_by.items() if (make.home, make.name) == (code.home, code.name)]
-    for name in same or former[-1:]:
+    for name in (same or former)[-1:]:
         registry.AGENTS[name] = dataclasses.replace(registry.AGENTS[name], make=code)
         return name
     name = code.name.rpartition(".")[2]

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from imagine_bench import registry
-from imagine_bench.errors import InvalidValueError, plain, require_known, require_modules
+from imagine_bench.errors import InvalidValueError, lacking, plain, require_known, require_modules
 from imagine_bench.protocols.data import Failure, Job, Launcher, OnProgress, Progress, Result
 from imagine_bench.store import run_folder
 from imagine_bench.store.files import make_folder, reading, table_rows
@@ -170,8 +170,10 @@ class _Run:
 
 class _TensorBoard:
     def __init__(self, out: Path, run: Path) -> None:
-        from tensorboard.summary import Writer  # noqa: PLC0415 - an extra
-
+        try:
+            from tensorboard.summary import Writer  # noqa: PLC0415 - an extra
+        except ImportError as error:
+            raise lacking("tensorboard") from error
         self._writer = Writer(str(out / run))
 
     def add(self, scalars: Scalars, episodes: int) -> None:
@@ -187,8 +189,10 @@ class _Wandb:
     _open: ClassVar[set[_Wandb]] = set()
 
     def __init__(self, out: Path, run: Path) -> None:
-        import wandb  # noqa: PLC0415 - an extra
-
+        try:
+            import wandb  # noqa: PLC0415 - an extra
+        except ImportError as error:
+            raise lacking("wandb") from error
         quiet = wandb.Settings(
             console="off", silent=True, x_disable_stats=True, x_disable_meta=True, disable_git=True, save_code=False
         )

@@ -19,13 +19,14 @@ LeRobot's rows are commands: there the observation after the last one is left ou
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from imagine_bench import registry
-from imagine_bench.arrays import Arrays
+from imagine_bench.arrays import Arrays, content_hash
 from imagine_bench.data.folder import FORMATS, read_card
 from imagine_bench.errors import ArtefactError
 
@@ -34,12 +35,13 @@ OBSERVATIONS = (*CAMERAS, "proprio")
 """The arrays that hold one entry more than there are commands."""
 PROPRIO_NAMES = (
     *(f"joint {index}, rad" for index in range(7)),
-    "left finger, m",
-    "right finger, m",
+    *("left finger, m", "right finger, m"),
     *(f"hand {axis}, m" for axis in "xyz"),
     *(f"hand quaternion {part}" for part in "wxyz"),
 )
 """The meaning of each number of ``proprio``."""
+OUTCOMES = ("rewards", "terminated", "truncated", "success", "instruction")
+"""The arrays that follow from the commands."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,3 +68,19 @@ def read_demonstrations(folder: Path) -> Demonstrations:
         raise ArtefactError(f"{folder} has no demonstrations; 'imagine-bench dataset ArrowPuzzleMotion' makes some.")
     registry.load(FORMATS[card["format"]])
     return Demonstrations(folder=folder, card=card)
+
+
+class Digest:
+    """A digest of episodes, in their order: the same in each format."""
+
+    def __init__(self) -> None:
+        self._sha = hashlib.sha256()
+
+    def add(self, episode: Arrays) -> None:
+        """Add an episode."""
+        n_steps = len(episode["rewards"])
+        held = {name: array[:n_steps] for name, array in episode.items()}
+        self._sha.update(content_hash(held).encode())
+
+    def __str__(self) -> str:
+        return self._sha.hexdigest()

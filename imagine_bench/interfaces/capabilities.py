@@ -22,11 +22,7 @@ _ROUNDING = 0.001
 
 @dataclass(frozen=True, kw_only=True)
 class ImaginedRollout:
-    """An imagined rollout from one real frame; index d is the imagined result of ``actions[d]``.
-
-    Raises:
-        InvalidValueError: An image has values out of range.
-    """
+    """An imagined rollout from one real frame; index d is the imagined result of ``actions[d]``."""
 
     actions: Ints  #: macro-actions imagined. Shape (D,), int64.
     #: decoded latents as images of the whole view in [0, 1], gray (D, H', W') or RGB (D, H', W', 3)
@@ -44,12 +40,14 @@ class ImaginedRollout:
     accepted: Bools
     macrostates: Ints  #: the macrostate a probe reads from each imagined latent. Shape (D, M).
 
-    def __post_init__(self) -> None:
+    def in_range(self) -> ImaginedRollout:
+        """This rollout. Raises InvalidValueError if an image has values out of range."""
         for name in ("frames", "start_frame"):
             image = np.asarray(getattr(self, name))
             if not (np.abs(image - 0.5) <= 0.5 + _ROUNDING).all():  # no NaN is either
                 found = f"from {image.min():.3g} to {image.max():.3g}"
                 raise InvalidValueError(f"imagine() gave {name} {found}; give values from 0 to 1.")
+        return self
 
 
 @runtime_checkable

@@ -60,7 +60,7 @@ class AgentModel(Untaught):
         for row, seeds in enumerate(rng.integers(2**63, size=(len(frames), samples))):
             for seed in seeds:
                 given = {"actions": actions[row, -depth:], "depth": depth, "rng": np.random.default_rng(seed)}
-                rollouts.append(self.agent.imagine(frames[row, -1], **given))
+                rollouts.append(self.agent.imagine(frames[row, -1], **given).in_range())
 
         def stacked(name: str) -> Floats:  # [N, S, D, ...]
             found = np.array([getattr(rollout, name) for rollout in rollouts], dtype=np.float64)

@@ -43,7 +43,8 @@ def imagined_from(
     found = []
     for row, frame in enumerate(frames):
         given = None if actions is None else read_only(actions[row])
-        found.append(agent.imagine(read_only(frame), actions=given, depth=depth, rng=seeds.child(row).generator()))
+        rng = seeds.child(row).generator()
+        found.append(agent.imagine(read_only(frame), actions=given, depth=depth, rng=rng).in_range())
     return found
 
 

@@ -110,7 +110,7 @@ def carry_out(
     rng = SeedTree(trained.spec.seed).child("planning", number).generator()
     agent = trained.imaginer
     begin_episode(agent)
-    rollout = agent.imagine(frame, actions=None, depth=trained.task.horizon, rng=rng)
+    rollout = agent.imagine(frame, actions=None, depth=trained.task.horizon, rng=rng).in_range()
     refused = _refusal(rollout, max_epistemic)
     tell = on_step or (lambda done: None)
     tell(0)

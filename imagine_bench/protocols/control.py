@@ -53,8 +53,6 @@ from imagine_bench.values import Setting
 
 TASK_CODE = "task "
 """Beginning of the names of tasks in :attr:`.ProtocolData.code`; no agent's name has a space."""
-_FOLDERS = ("report", "tensorboard", "wandb", "why")
-"""Folders of a bench that are no agent's."""
 _AFTER_EPISODES = 100
 _AT_LEAST = {
     "after_episodes": 1,
@@ -345,8 +343,6 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     code = (*registered_code(wanted.agents), *package_digests(wanted.code_places()))
     wanted = dataclasses.replace(wanted, code=tuple(sorted(code)))
     for agent in wanted.agents:  # a protocol that is only read may be of a package that is not here
-        if agent in _FOLDERS:
-            raise InvalidValueError(f"A bench has a folder {agent!r} of its own; give the agent another name.")
         _require_takes(agent, wanted)
         _require_exact_world(agent, wanted)
     _require_learner(wanted)

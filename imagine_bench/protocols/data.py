@@ -39,6 +39,10 @@ def digest(values: Json) -> str:
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:12]
 
 
+_FOLDERS = frozenset({"report", "tensorboard", "wandb", "why"})
+"""Folders of a bench that are no agent's."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class ProtocolData(ABC):
     """A comparison, completely specified by JSON-like values."""
@@ -73,6 +77,8 @@ class ProtocolData(ABC):
         require_known("device", self.device, DEVICES)
         object.__setattr__(self, "seeds", require_seeds(self.seeds))
         require_different("agents", self.agents)
+        for agent in _FOLDERS.intersection(self.agents):
+            raise InvalidValueError(f"A bench has a folder {agent!r} of its own; give the agent another name.")
 
     def as_dict(self) -> dict[str, Json]:
         """A JSON-serialisable copy; fields marked :data:`OPTIONAL_IN_HASH` are in it where they say something."""

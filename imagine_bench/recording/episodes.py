@@ -231,7 +231,7 @@ class _EpisodeRecorder:
         spec = self.spec
         seeds = SeedTree(self.seed)
         rng = seeds.child("recording", episode, step).generator()
-        rollout = self.agent.imagine(frame, actions=None, depth=IMAGINED_DEPTH, rng=rng)
+        rollout = self.agent.imagine(frame, actions=None, depth=IMAGINED_DEPTH, rng=rng).in_range()
         moment = Moment(
             spec=spec,
             appearance=self.appearance,

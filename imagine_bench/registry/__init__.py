@@ -213,16 +213,21 @@ def _configured_entry(name: str, own: Mapping[str, Any], group: str) -> Any:
 
 
 def known_entry(agent: str) -> AgentEntry | None:
-    """The registry line of an agent, None of one that is not installed here or whose package offers it wrongly."""
-    with suppress(UnknownNameError, InvalidValueError, SetupError):
+    """The registry line of an agent, None of one whose package is not installed here.
+
+    Raises:
+        InvalidValueError: As :func:`agent_entry`.
+    """
+    with suppress(UnknownNameError, SetupError):
         return agent_entry(agent)
     return None
 
 
 def is_player(agent: str) -> bool:
     """Whether an agent's name is that of a person, or of a program elsewhere, such as ``person:anna``."""
-    entry = known_entry(agent)
-    return entry is not None and entry.is_player
+    with suppress(UnknownNameError, InvalidValueError, SetupError):
+        return agent_entry(agent).is_player
+    return False
 
 
 def _prefixes(group: str) -> Mapping[str, Any]:

@@ -136,7 +136,8 @@ class KeyboardGame(gymnasium.Wrapper[Frame, Action, Frame, Action]):
             self._actions.append(action)
             actions = np.array(self._actions)
             rng = np.random.default_rng(self._seed)
-            self._rollout = self._imaginer.imagine(self._start, actions=actions, depth=len(actions), rng=rng)
+            rollout = self._imaginer.imagine(self._start, actions=actions, depth=len(actions), rng=rng)
+            self._rollout = rollout.in_range()
         done = self.env.step(action)
         return done, self._showing(done)
 

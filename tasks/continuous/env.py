@@ -272,7 +272,9 @@ class MotionEnv(SceneEnv):
             InvalidValueError: As :meth:`step`; then nothing has moved.
         """
         self._require_begun()
-        periods_left = max(0.0, self.time_limit_s / self.period_s - 0.5 - self.episode.periods)
+        if self.episode.periods and self._is_at_limit():
+            return []
+        periods_left = self.time_limit_s / self.period_s - self.episode.periods
         actions = actions[: math.ceil(min(periods_left, len(actions)))]
         before = self.data.ctrl[self.columns.ctrl]
         commands = []
@@ -339,6 +341,12 @@ class MotionEnv(SceneEnv):
         targets: Floats = self.data.ctrl[self.columns.ctrl[: len(ARM_JOINTS) + 1]].copy()
         return targets
 
+    def servo_forces(self) -> Floats:
+        """The present efforts of the servos: torques of the seven joints (N m), forces of both fingers (N). Shape
+        (9,).
+        """
+        return np.asarray(self.data.actuator_force[self.columns.ctrl])
+
     def get_state(self) -> MotionState:
         """All that decides how the episode goes on, copied; of a wrapper it knows nothing."""
         return MotionState(
@@ -362,6 +370,10 @@ class MotionEnv(SceneEnv):
         self.world.set_slipping(episode.slipping)
 
     # --- details -------------------------------------------------------------------------------------------------
+
+    def _is_at_limit(self) -> bool:
+        """Whether no later end of a period is nearer to the time limit."""
+        return self.elapsed_s >= self.time_limit_s - self.period_s / 2
 
     def _servo_change(self, action: Floats, before: Floats) -> tuple[Floats, str]:
         """The change of the servos' commands in an action's period: joints, then fingers (9,); and the limit met."""
@@ -393,7 +405,7 @@ class MotionEnv(SceneEnv):
             before = episode.potential
             episode.potential = 0.0 if terminated else self._potential(episode.macrostate)
             reward += episode.potential - before
-        truncated = self.elapsed_s >= self.time_limit_s - self.period_s / 2
+        truncated = self._is_at_limit()
         if event is None:
             return Period(reward, terminated, truncated)
         return Period(reward, terminated, truncated, event.outcome.success, episode.macrostate, event.fault)

@@ -12,7 +12,7 @@ from typing import Any, SupportsFloat
 import numpy as np
 import pytest
 from forger import FORGERIES, IN_TRAINING, forged, share_weights
-from forging import OpenRun, of_second, oracle, rewrite_protocol
+from forging import OpenRun, all_runs, of_second, oracle, rewrite_protocol
 from guest_packages import Guests
 from kinds import take_row
 from small_runs import Inline, benched, collected, made_bench, small
@@ -257,6 +257,16 @@ def test_what_a_protocol_says_follows_from_its_runs(
 ) -> None:
     folder = rewrite_protocol(forged(pair, tmp_path), **claim)
     assert complaint in " ".join(each.complaint for each in verify(folder))
+
+
+def test_a_name_that_no_agent_can_have_is_a_complaint(pair: Path, tmp_path: Path) -> None:
+    folder = forged(pair, tmp_path)
+    for run in all_runs(folder):
+        run.config["agent"] = "person"
+        run.write()
+    (folder / "table").rename(folder / "person")
+    folder = rewrite_protocol(folder, agents=["person"])
+    assert "person alone is no name" in " ".join(each.complaint for each in verify(folder))
 
 
 @pytest.mark.parametrize("agents", [("dqn",), ("factored:given",), ("dqn", "factored:given")])

@@ -41,8 +41,7 @@ def variants(hint: Any) -> list[Any]:
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is np.ndarray:
         dtype = get_args(arguments[1])[0] if get_args(arguments[1]) else np.float64
-        steps = np.arange(6) / 8 if np.issubdtype(dtype, np.floating) else np.arange(6)  # images lie in [0, 1]
-        return [steps.reshape(3, 2).astype(dtype)]
+        return [np.arange(6).reshape(3, 2).astype(dtype)]
     if origin in (Union, types.UnionType):
         return [None, *(value for each in arguments if each is not types.NoneType for value in variants(each))]
     if dataclasses.is_dataclass(hint):

@@ -16,7 +16,6 @@ import pytest
 from imagine_bench_motion.control import datasets, demonstrator
 from imagine_bench_motion.control.datasets import (
     DemonstrationSettings,
-    Digest,
     collect,
     demonstration,
     describe,
@@ -28,7 +27,7 @@ from imagine_bench import registry
 from imagine_bench.arrays import Arrays, content_hash
 from imagine_bench.cli import exit_code as main
 from imagine_bench.data.folder import FORMATS, new_folder, read_card, read_dataset, read_files, write_card
-from imagine_bench.data.motion import CAMERAS, Demonstrations, read_demonstrations
+from imagine_bench.data.motion import CAMERAS, Demonstrations, Digest, read_demonstrations
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.seeding import episode_seed
 

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
-import sys
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,13 +14,11 @@ from imagine_bench.interfaces import Observation, Transition
 
 pytest.importorskip("torch_world")
 import torch
-from imagine_bench.agents.networks.allocator import keep_freed_memory
 from imagine_bench_peers import lewm
-from imagine_bench_peers.lewm import LeWMPlanner, make, release_freed_memory
+from imagine_bench_peers.lewm import LeWMPlanner, make
 
 PLACES = 4  # a white quarter of the frame, at one of four places on a ring
 GOAL = 2
-_MIB = 2**20
 
 
 def learner(seed: int = 0, **overrides: Any) -> LeWMPlanner:
@@ -167,25 +162,6 @@ def test_freed_memory_goes_back_every_fifty_updates(monkeypatch: pytest.MonkeyPa
     agent = learner(replay_ratio=20.0)
     trained(agent, 9)
     assert agent.updates == 120 and released == [50, 100]
-
-
-def resident_mib() -> float:
-    """Memory of this process that is in use by the system's account, in MiB."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * 4096 / _MIB
-
-
-@pytest.mark.skipif(sys.platform != "linux" or not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="needs glibc")
-def test_memory_between_blocks_in_use_goes_back() -> None:
-    keep_freed_memory()
-    large, small = [], []
-    for _ in range(100):
-        large.append(np.ones(_MIB, dtype=np.uint8))
-        small.append(np.ones(12_288, dtype=np.uint8))
-    large.clear()
-    before = resident_mib()
-    release_freed_memory()
-    assert resident_mib() < before - 90 and all(each.all() for each in small)
 
 
 @pytest.mark.parametrize("wrong", [{"model.patch": 7}, {"model.embedding": 22}])

@@ -1,4 +1,4 @@
-"""The uncertainty of sampled values, and divergences that are known."""
+"""The uncertainty of sampled values, divergences that are known, and the causes of the expected squared error."""
 
 from __future__ import annotations
 
@@ -10,10 +10,16 @@ import torch
 from imagine_bench.agents.imagination import mixture as mdn
 from imagine_bench.agents.imagination.mixture import Mixture
 from imagine_bench.agents.imagination.uncertainty import decompose
+from imagine_bench_regression import toy_regression as toy
 from imagine_bench_regression.uncertainty import jensen_shannon, sampled_component_variance
 from scipy import integrate, stats
 
 Rows = list[list[float]]
+PAIRS = 400_000
+SURE = 4.5
+"""Standard errors beyond which chance is no explanation."""
+X = 12.5
+"""Where all of the causes are worth mentioning: the branches are 13 apart (standard deviation)."""
 
 
 def mixtures(weights: Rows, means: Rows, sigmas: Rows) -> Mixture:
@@ -77,3 +83,46 @@ def test_divergence_sees_what_the_variance_of_means_does_not() -> None:
     two = mixtures([[0.5, 0.5]] * 2, [[-3.0, 3.0], [0.0, 0.0]], [[math.exp(-1.0)] * 2] * 2)
     assert decompose(two).epistemic.item() == 0.0
     assert divergence(two, 100)[0] > 0.6
+
+
+# Equation 4.8 (appendix A of the thesis) -----------------------------------------------------------------------------
+
+WEIGHTS = [[0.5, 0.5], [0.9, 0.1], [0.2, 0.8], [0.4, 0.6]]
+MEANS = [[20.0, 45.0], [30.0, 10.0], [35.0, 40.0], [22.0, 50.0]]
+SIGMAS = [[4.0, 6.0], [5.0, 5.0], [7.0, 3.0], [9.0, 2.0]]
+"""Four weight samples, mixtures of two components that lie beside the truth at X."""
+
+
+def causes(sigma: float) -> dict[str, float]:
+    parts = decompose(mixtures(WEIGHTS, MEANS, SIGMAS))
+    mean = float(np.sum(np.multiply(WEIGHTS, MEANS), axis=1).mean())
+    branches = toy.branches(np.array(X))
+    return {
+        "bias²": (branches.mean() - mean) ** 2, "epistemic": float(parts.epistemic), "aleatoric": sigma**2,
+        "modal": float(branches.var()), "spread": float(parts.aleatoric + parts.modal),
+    }  # fmt: skip
+
+
+def drawn(rng: np.random.Generator) -> np.ndarray:
+    """Values of the mixtures of drawn weight samples. Shape (PAIRS,)."""
+    weights, means, sigmas = map(np.array, (WEIGHTS, MEANS, SIGMAS))
+    t = rng.integers(len(weights), size=PAIRS)
+    k = (rng.random(PAIRS) > weights[t, 0]).astype(int)
+    return means[t, k] + sigmas[t, k] * rng.standard_normal(PAIRS)
+
+
+def targets(sigma: float, rng: np.random.Generator) -> np.ndarray:
+    """Of the process of thesis 4.5.1 at X, by its definition. Shape (PAIRS,)."""
+    f = np.array([7 * np.sin(0.75 * X) + 0.5 * X, 3 * np.sin(0.5 * X) + 3 * X - 5, 2 * np.sin(0.3 * X) - 0.2 * X + 20])
+    return f[rng.integers(3, size=PAIRS)] + sigma * rng.standard_normal(PAIRS)
+
+
+def test_the_error_is_the_sum_of_its_causes_and_of_no_fewer() -> None:
+    rng = np.random.default_rng(0)
+    squared = (targets(3.0, rng) - drawn(rng)) ** 2
+    error = squared.std() / np.sqrt(PAIRS)
+    terms = causes(3.0)
+    left = squared.mean() - sum(terms.values())
+    assert abs(left) < SURE * error
+    for name, value in terms.items():
+        assert left + value > SURE * error, f"{name} could be left out"

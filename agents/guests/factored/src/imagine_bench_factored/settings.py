@@ -6,17 +6,15 @@ from dataclasses import dataclass, field
 
 from imagine_bench.agents.settings import (
     COUNT,
+    INSIDE,
     POSITIVE,
     PROBABILITY,
     RATE,
     SWITCH,
     Hyperparameters,
-    Range,
     between,
     setting,
 )
-
-INSIDE = Range(lambda value: 0.0 < value < 1.0, "must lie between 0 and 1")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,7 +6,6 @@ Macro-actions are few, so all sequences are priced where the paper samples some 
 
 from __future__ import annotations
 
-import ctypes
 from itertools import product
 from typing import Any
 
@@ -15,6 +14,7 @@ import torch
 from imagine_bench.agents import snapshot
 from imagine_bench.agents.encoders.perception import prepare_torch
 from imagine_bench.agents.meters import Meters
+from imagine_bench.agents.networks.allocator import release_freed_memory
 from imagine_bench.agents.settings import flatten
 from numpy.typing import NDArray
 from torch import Tensor, nn
@@ -193,19 +193,6 @@ class LeWMPlanner:
         self.steps = values["steps"]
         self.updates = values["updates"]
         self._owed = values["owed"]
-
-
-def release_freed_memory() -> None:
-    """Ask glibc to give all freed memory back to the system, also between blocks in use; elsewhere do nothing.
-
-    A learner that keeps small blocks between large ones that it frees, such as frames between activations, takes more
-    and more memory otherwise.
-    """
-    try:
-        trim = ctypes.CDLL(None).malloc_trim
-    except (OSError, AttributeError, TypeError):
-        return
-    trim(0)
 
 
 def _network(settings: LeWMSettings, n_actions: int) -> LeWM:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import hashlib
 import itertools
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,9 +20,9 @@ from tqdm import tqdm
 
 from imagine_bench import registry, statistics
 from imagine_bench.appearance import appearance_name, appearance_typed
-from imagine_bench.arrays import Array, Arrays, Info, Observed, content_hash
+from imagine_bench.arrays import Array, Arrays, Info, Observed
 from imagine_bench.data.folder import FORMATS, new_folder, read_files, write_card
-from imagine_bench.data.motion import CAMERAS, OBSERVATIONS, Demonstrations
+from imagine_bench.data.motion import CAMERAS, OBSERVATIONS, OUTCOMES, Demonstrations, Digest
 from imagine_bench.errors import ArtefactError, InvalidValueError, RunFailedError, brief, require, require_known
 from imagine_bench.registry.machine import describe_environment
 from imagine_bench.running.collect import MOST_EPISODES
@@ -41,8 +40,6 @@ POLICIES = {
     "mixed": "expert, noisy and random, an episode each in turn",
 }
 _IN_TURN = ("expert", "noisy", "random")
-_OUTCOMES = ("rewards", "terminated", "truncated", "success", "instruction")
-"""The arrays that follow from the commands."""
 _SAME_M = 2e-3
 """How far the arm's own sense (rad and m) may be off in a replay: kinds of CPU differ in the last bits."""
 
@@ -56,22 +53,6 @@ class Actor(Protocol):
 
     def act(self) -> Array | None:
         """The next command, or None, which leaves the episode."""
-
-
-class Digest:
-    """A digest of episodes, in their order: the same in each format."""
-
-    def __init__(self) -> None:
-        self._sha = hashlib.sha256()
-
-    def add(self, episode: Arrays) -> None:
-        """Add an episode."""
-        n_steps = len(episode["rewards"])
-        held = {name: array[:n_steps] for name, array in episode.items()}
-        self._sha.update(content_hash(held).encode())
-
-    def __str__(self) -> str:
-        return self._sha.hexdigest()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -341,7 +322,7 @@ def _compare(where: str, kept: Arrays, found: Arrays) -> None:
     lengths = [len(each["rewards"]) for each in (found, kept)]
     ends = found["terminated"][-1] or found["truncated"][-1]
     require(lengths[0] == lengths[1] and bool(ends), f"{where}: its commands do not end it, or go on after its end.")
-    for name in (*_OUTCOMES, "macrostates"):
+    for name in (*OUTCOMES, "macrostates"):
         then = kept[name]
         now = found[name]
         require(then.shape == now.shape, f"{where}: {name} has shape {now.shape}, and the file has {then.shape}.")

@@ -72,7 +72,7 @@ class _MotionRecorder:
         for name, part in seen.items() if isinstance(seen, dict) else ():
             if part.ndim == 3:
                 recording.log(f"/motion/{name}", rr.Image(part))
-        *joints_nm, left_n, right_n = env.data.actuator_force[env.columns.ctrl].tolist()
+        *joints_nm, left_n, right_n = env.servo_forces().tolist()
         recording.curves("/motion/fingers", {"left finger, N": left_n, "right finger, N": right_n})
         recording.curves("/motion/joints", {f"joint {index}, N m": each for index, each in enumerate(joints_nm)})
         recording.curves("/motion", {"reward": reward})
