@@ -150,6 +150,28 @@ def test_the_likelihood_of_values_is_a_product_of_predictions() -> None:
     assert appearance.follows(values, actions, following) == pytest.approx(np.log(product))
 
 
+def test_merging_values_costs_what_they_told_of_the_next_ones() -> None:
+    """A wheel of four places that turns or stays, and a lamp; merged are two places, or two looks of one place."""
+    rng = np.random.default_rng(0)
+    actions = rng.integers(2, size=61)
+    place = np.concatenate([[0], actions[:-1].cumsum()]) % 4
+    look = rng.integers(2, size=61)  # of a place, by chance
+    lamp = rng.integers(3, size=61)
+    merged = np.maximum(place - 1, 0)
+    true = np.stack([place, lamp], axis=1)
+
+    def lost(finer: NDArray[np.int64], coarser: NDArray[np.int64]) -> float:
+        return appearance.lost_by_merging(finer[:-1], coarser[:-1], actions[:-1], coarser[1:])
+
+    told, left = (appearance.follows(values[:-1], actions[:-1], merged[1:]) for values in (place, merged))
+    assert lost(true, np.stack([lamp, merged], axis=1)) == pytest.approx(told - left) and told > left
+    assert lost(np.stack([2 * place + look, lamp], axis=1), true) < 0.0, "looks tell nothing"
+    assert lost(true, np.stack([lamp, (place + 1) % 4], axis=1)) == 0.0, "the same by other names"
+    assert lost(true, merged[:, None]) == 0.0, "not a factor less"
+    both = np.stack([merged, 2 * lamp + look], axis=1)
+    assert lost(true, both) == 0.0, "another factor is split"
+
+
 def test_what_changes_only_between_episodes_is_a_factor_too() -> None:
     """A mark at one of four places at the start of episodes of 25 frames: seldom in all, but often there."""
     rng = np.random.default_rng(0)

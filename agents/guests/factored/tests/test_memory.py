@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from unittest import mock
@@ -145,17 +146,40 @@ def seeing() -> AgentState:
     return learner.state()
 
 
-def test_factors_are_kept_where_new_ones_contradict_outcomes(seeing: AgentState) -> None:
-    """Once it sees well, another look that loses the lamp is not believed."""
+Factors = list[own.appearance.SeenFactor]
+
+
+def without_lamp(factors: Factors) -> Factors:
+    return [factor for factor in factors if len(factor.joint) == 3]
+
+
+def with_a_blurred_wheel(factors: Factors) -> Factors:
+    """The first two values of a wheel are one."""
+    place = next(place for place, factor in enumerate(factors) if len(factor.joint) == 3)
+    (part,) = factors[place].parts
+    blurred = own.appearance.SeenFactor((part._replace(values=np.maximum(part.values - 1, 0)),), np.arange(2)[:, None])
+    return [*factors[:place], blurred, *factors[place + 1 :]]
+
+
+@pytest.mark.parametrize(("worse", "worth"), [(without_lamp, 1.0), (with_a_blurred_wheel, 0.0)])
+def test_factors_are_kept_where_new_ones_are_worse(
+    seeing: AgentState, worse: Callable[[Factors], Factors], worth: float
+) -> None:
+    """Once it sees well, a look that loses the lamp is not believed, because of outcomes that contradict it.
+
+    Nor is one that merges two values of a wheel, because of what follows them, even if no outcome contradicts it.
+    """
     learner, resumed = (agent(seed=seed, perception__growth_if_known=1.25) for seed in (0, 5))
     learner.restore(seeing)
+    if not worth:
+        learner.reset_for_new_task()  # which has no rewards
     find = own.appearance.find
 
-    def blind(frames: Frame, begins: NDArray[np.bool_], actions: NDArray[np.int64]) -> list[own.appearance.SeenFactor]:
-        return [factor for factor in find(frames, begins, actions) if len(factor.joint) == 3]
+    def look(frames: Frame, begins: NDArray[np.bool_], actions: NDArray[np.int64]) -> Factors:
+        return worse(find(frames, begins, actions))
 
-    with mock.patch.object(own.appearance, "find", side_effect=blind) as found:
-        watched(learner, range(30, 41))
+    with mock.patch.object(own.appearance, "find", side_effect=look) as found:
+        watched(learner, range(30, 41), worth=worth)
     assert found.called, "it looked again"
     assert learner.perception.sizes == (3, 3, 2)
     resumed.restore(learner.state())

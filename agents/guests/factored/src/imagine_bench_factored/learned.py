@@ -90,23 +90,24 @@ class LearnedPerceptionAgent(CodeAgent):
     def _recode(self, frame_factors: FrameFactors, found_in: int) -> None:
         """Give every replayed transition the codes that its frames have now, and learn from all of them once more.
 
-        The factors seen before are kept where outcomes contradict the present factors and did not contradict
-        those.
+        The factors seen before are kept where outcomes contradict the present factors and did not contradict those,
+        and where the present factors tell fewer values apart and so predict worse.
         """
         perception = self.perception
         count = len(self.replay)
         of_task = slice(self.tasks[-1] if self.tasks else 0, count)  # other tasks have other outcomes
         rows = self._rows()
         few = _CONTRADICTIONS * (count - of_task.start)
-        if frame_factors.factors and _contradictions(rows[of_task]) > few:
+        if frame_factors.factors:
             factors_now = perception.frame_factors
             found_now_in = perception.found_in
             perception.take(frame_factors, found_in)
             earlier = self._rows()
-            if _contradictions(earlier[of_task]) > few:
-                perception.take(factors_now, found_now_in)
-            else:
+            worse = _contradictions(rows[of_task]) > few or _merges(earlier, rows)
+            if worse and _contradictions(earlier[of_task]) <= few:
                 rows = earlier
+            else:
+                perception.take(factors_now, found_now_in)
         begins = perception.begins
         classed = reward_classes(rows[of_task]).of(rows[of_task])
         perception.memory = choose(classed, begins[of_task], perception.seen_sizes, self.n_actions, self.settings)
@@ -164,6 +165,17 @@ class LearnedPerceptionAgent(CodeAgent):
 def _contradictions(rows: Sequence[CodeTransition]) -> int:
     """As :func:`.factors.contradictions`, but for those of rewards that chance changes."""
     return contradictions(reward_classes(rows).of(rows))
+
+
+def _merges(earlier: Sequence[CodeTransition], present: Sequence[CodeTransition]) -> bool:
+    """Whether the present codes of the same transitions merge values of earlier ones and so predict worse."""
+    clear = [(was, now) for was, now in zip(earlier, present, strict=True) if was.is_clear and now.is_clear]
+    if not clear:
+        return False
+    codes = np.array([was.code for was, _ in clear])
+    actions = np.array([now.action for _, now in clear])
+    merged, following = (np.array([row[of] for _, row in clear]) for of in (0, 2))
+    return appearance.lost_by_merging(codes, merged, actions, following) > 0.0
 
 
 def _flat(state: AgentState) -> AgentState:

@@ -422,6 +422,28 @@ def follows(values: Ints, actions: Ints, following: Ints) -> float:
     return float(log(table + 1.0).sum() + (log(width) - log(width + table.sum(axis=1))).sum())
 
 
+def lost_by_merging(finer: Codes, coarser: Codes, actions: Ints, following: Codes) -> float:
+    """How much likelier ``finer`` codes (N, P) than ``coarser`` ones (N, P) make the next coarser ones (N, P).
+
+    That is :func:`follows`, summed over the factors in which values are merged. 0 unless each factor of the coarser
+    codes is one of the finer codes, but for the numbers of its values, or merges values of one.
+    """
+    lost = 0.0
+    for values, after in zip(coarser.T, following.T, strict=True):
+        of = [each for each in finer.T if _tells(each, values)]
+        if finer.shape != coarser.shape or not of:
+            return 0.0
+        one = min(of, key=lambda each: len(np.unique(each)))
+        if not _tells(values, one):
+            lost += follows(one, actions, after) - follows(values, actions, after)
+    return lost
+
+
+def _tells(one: Ints, other: Ints) -> bool:
+    """Whether of two factors (N,) the values of ``one`` leave a single value of ``other`` each."""
+    return len(np.unique(np.stack([one, other]), axis=1).T) == len(np.unique(one))
+
+
 def groups(apart: Floats, below: float = np.inf) -> tuple[Ints, float]:
     """Groups (N,) of crops by their distances (N, N), numbered as they come, and the distance that parts them.
 
