@@ -129,7 +129,7 @@ class _Lit(Glimpse):
 TINY = {
     "walls": (CORRIDOR, _Wall(), 5),
     "late": (CORRIDOR, _Lit(lag=1), 4),
-    "later": (CORRIDOR, _Lit(lag=2), 5),
+    "later": (EARLY, _Lit(lag=2), 5),
     "slipping": (dataclasses.replace(CORRIDOR, slip=0.2), _Wall(), 6),
     "solved if no later": (EARLY, _Lit(lag=1), 5),
     "solved if later": (LATE, _Lit(lag=1), 5),
