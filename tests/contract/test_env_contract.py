@@ -206,6 +206,17 @@ def test_rewards_follow_what_was_read_where_a_cube_does_not_turn():
     assert (reward, terminated) == (-1.0, False)
 
 
+def test_a_cube_that_is_turned_the_other_way_is_judged_by_where_it_is():
+    env = make().unwrapped
+    env.reset(seed=0, options={"macrostate": (1, 2, 0, 1)})
+    turn = env.world.executor.turn
+    env.world.executor.turn = lambda clockwise, **others: turn(clockwise=not clockwise, **others)
+    _, reward, terminated, _, info = env.step(4)
+    env.close()
+    assert info["fault_reason"] == "the scene reads (1, 2, 3, 1), the rules say (1, 2, 1, 1)"
+    assert (reward, terminated, info["legal"], info["success"]) == (-1.0, False, True, False)
+
+
 @pytest.mark.parametrize("shift_m", [0.0, 0.004, 0.006])
 @pytest.mark.parametrize(
     ("task", "start", "motion", "pushed", "words"),
