@@ -117,18 +117,6 @@ def test_every_vector_id_has_the_limit_and_options_of_its_single_one():
     assert named[True] is None and named[False] > 0
 
 
-def test_lanes_of_continuous_control_last_as_long_as_single_environments():
-    """Here for thirteen commands, more than the task has macro-actions."""
-    options = {"time_limit_s": 0.52, "observation": "proprio"}
-    one = gymnasium.make("imagine_bench/ArrowPuzzleMotion-v0", **options)
-    many = gymnasium.make_vec("imagine_bench/ArrowPuzzleMotion-vector-v0", num_envs=2, **options)
-    one.reset(seed=0)
-    many.reset(seed=0)
-    still = np.zeros(many.action_space.shape, dtype=np.float32)
-    cut = [[one.step(still[0])[3], *many.step(still)[3].tolist()] for _ in range(13)]
-    assert cut == [[False] * 3] * 12 + [[True] * 3]
-
-
 def quiet_plan(rules, state, length, rng):
     """Actions that end no episode."""
     actions = []
