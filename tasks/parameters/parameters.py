@@ -181,7 +181,7 @@ class WorldParameters:
             if name not in spellings:
                 continue
             if spellings[name] in given:
-                raise InvalidValueError(f"{name} and {spellings[name]} are one parameter; give it once.")
+                raise InvalidValueError(f"{spellings[name]} is given by both of its names; give it once.")
             given[spellings[name]] = options.pop(name)
         return cls(**given)
 

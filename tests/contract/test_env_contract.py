@@ -17,7 +17,6 @@ from imagine_bench.tasks.arrows.world import ArrowWorld
 from imagine_bench.tasks.rendering import Renderer
 from imagine_bench.tasks.rendering.cameras import human_camera_view
 from imagine_bench.tasks.scenes.appearance import appearance
-from imagine_bench.tasks.scenes.constants import ARM_GROUP
 from worlds import WORLDS
 
 import imagine_bench  # noqa: F401  (registers the environments)
@@ -168,13 +167,11 @@ def test_starts_are_spread_over_the_start_states(task):
     assert chi_square < len(starts) + 5 * np.sqrt(2 * len(starts))
 
 
-@pytest.mark.parametrize("camera", ["human", "far", "wrist"])
-def test_views_are_of_their_camera_and_draw_no_random_number(camera):
-    env = make(appearance="strong", render_mode="rgb_array", width=80, height=60, camera=camera, **KINEMATIC).unwrapped
+def test_views_for_people_draw_no_random_number():
+    env = make(appearance="strong", render_mode="rgb_array", width=80, height=60, camera="far", **KINEMATIC).unwrapped
     env.reset(seed=0)
     before = env.np_random.bit_generator.state
-    view = human_camera_view("human", 80, 60)
-    with contextlib.closing(Renderer(env.model, dataclasses.replace(view, camera=camera))) as renderer:
+    with contextlib.closing(Renderer(env.model, human_camera_view("far", 80, 60))) as renderer:
         drawn = renderer.frame(env.data)
     first, again = env.render(), env.render()
     assert first.shape == (60, 80, 3) and not np.shares_memory(first, again)
@@ -191,19 +188,15 @@ def test_views_are_of_their_camera_and_draw_no_random_number(camera):
 # --- faults ------------------------------------------------------------------------------------------------------
 
 
-def test_rewards_follow_what_was_read_where_a_cube_does_not_turn():
-    """Fingers that touch nothing: the arm turns, the cube stays, and the environment says so."""
+def test_a_cube_that_is_turned_the_other_way_is_judged_by_where_it_is():
     env = make().unwrapped
-    model = env.world.model
-    arm = np.flatnonzero((model.geom_group == ARM_GROUP) | (model.geom_contype == 2))
-    model.geom_contype[arm] = model.geom_conaffinity[arm] = 0
-    env.reset(seed=0, options={"macrostate": (3, 1, 2, 0)})
-    _, reward, terminated, _, info = env.step(0)  # a good turn would reach the goal
+    env.reset(seed=0, options={"macrostate": (1, 2, 0, 1)})
+    turn = env.world.executor.turn
+    env.world.executor.turn = lambda clockwise, **others: turn(clockwise=not clockwise, **others)
+    _, reward, terminated, _, info = env.step(4)
     env.close()
-    assert info["fault"] and info["fault_reason"]
-    assert info["macrostate"].tolist() == [3, 1, 2, 0]
-    assert not info["success"]
-    assert (reward, terminated) == (-1.0, False)
+    assert info["fault_reason"] == "the scene reads (1, 2, 3, 1), the rules say (1, 2, 1, 1)"
+    assert (reward, terminated, info["legal"], info["success"]) == (-1.0, False, True, False)
 
 
 @pytest.mark.parametrize("shift_m", [0.0, 0.004, 0.006])

@@ -76,7 +76,8 @@ COMMANDS = {
         ("Arrows", "physics", SAME_STEP, 3, {"cubes": 5, "coupling": "neighbour", "slip": 0.3, "distractors": 3}),
         ("PickPlace", "physics", SAME_STEP, 4, {"gesture": 0.5, "lag": 1, "slip": 0.5}),
         ("PickPlace", "kinematic", AutoresetMode.NEXT_STEP, 8, {"observation": "frame,state,proprio", "size": 32}),
-        *((f"{name}Motion", "physics", SAME_STEP, 32, COMMANDS) for name in ("ArrowPuzzle", "PickPlace")),
+        ("ArrowPuzzleMotion", "physics", SAME_STEP, 32, COMMANDS),
+        ("PickPlaceMotion", "physics", SAME_STEP, 32, {**COMMANDS, "lag": 1}),
         *(("ArrowPuzzle", "kinematic", mode, 16, SHORT) for mode in MODES),
         ("PickPlace", "kinematic", MODES[0], 16, SHORT),
         *(pytest.param("PickPlace", "kinematic", mode, 16, SHORT, marks=pytest.mark.slow) for mode in MODES[1:]),
@@ -114,18 +115,6 @@ def test_every_vector_id_has_the_limit_and_options_of_its_single_one():
         assert many.kwargs == {**one.kwargs, "env": one.entry_point}, vector
         named["Motion" in single] = one.max_episode_steps
     assert named[True] is None and named[False] > 0
-
-
-def test_lanes_of_continuous_control_last_as_long_as_single_environments():
-    """Here for thirteen commands, more than the task has macro-actions."""
-    options = {"time_limit_s": 0.52, "observation": "proprio"}
-    one = gymnasium.make("imagine_bench/ArrowPuzzleMotion-v0", **options)
-    many = gymnasium.make_vec("imagine_bench/ArrowPuzzleMotion-vector-v0", num_envs=2, **options)
-    one.reset(seed=0)
-    many.reset(seed=0)
-    still = np.zeros(many.action_space.shape, dtype=np.float32)
-    cut = [[one.step(still[0])[3], *many.step(still)[3].tolist()] for _ in range(13)]
-    assert cut == [[False] * 3] * 12 + [[True] * 3]
 
 
 def quiet_plan(rules, state, length, rng):
@@ -277,6 +266,7 @@ def test_what_cannot_be_made_is_refused():
         ({"n": 0}, "num_envs is 0; give an integer from 1 on"),
         ({"threads": 1.5}, r"threads is 1\.5; give an integer from 1 on"),
         ({"max_episode_steps": -1}, "max_episode_steps is -1; give an integer from 1 on"),
+        ({"render_mode": "human"}, "No render mode 'human'. Known: rgb_array"),
         ({"autoreset_mode": "same_step"}, r"No autoreset mode 'same_step'\. Did you mean 'SameStep'\?"),
     ):
         with pytest.raises(ImagineBenchError, match=message):

@@ -14,6 +14,7 @@ from imagine_bench.exact import learner
 from imagine_bench.exact.certificate import certificate, certificate_rows
 from imagine_bench.exact.factors import factor_graph, machine
 from imagine_bench.exact.learner import learn
+from imagine_bench.interfaces import Outcome
 
 
 @pytest.mark.parametrize(
@@ -117,6 +118,42 @@ def test_the_cost_of_learning_is_a_mean_with_standard_error():
     assert cost.transitions == pytest.approx(np.mean(needed))
     assert cost.standard_error == pytest.approx(stats.sem(needed)) and cost.standard_error > 0.0
     assert cost.episodes == pytest.approx(np.mean([run.episodes for run in runs]))
+
+
+class _Doors(Wheels):
+    """Many starts, from each of which both actions succeed at once."""
+
+    n_actions = 2
+
+    @property
+    def start_states(self):
+        return [(start, 1) for start in range(1, self.n)]
+
+    def outcomes(self, state, action):
+        return (Outcome(1.0, (0, 0), 1.0, terminated=True, success=True),)
+
+
+@pytest.mark.parametrize(("starts", "learners"), [(900, 10), (1500, 6), (6000, 2)])
+def test_many_pairs_have_fewer_learners_behind_their_cost(starts, learners, capsys):
+    """20,000 pairs of macrostate and action in all, but two to ten learners; here each is done after one transition."""
+    spec = dataclasses.replace(spec_of(Wheels(n=1), 5), rules=_Doors(n=starts + 1))
+    cost = certificate(spec).learning_cost
+    assert (cost.learners, cost.transitions, cost.episodes, cost.standard_error) == (learners, 1.0, 1.0, 0.0)
+    told = "The exact facts of wheels are computed, about 4 s.\n" if starts > 5000 else ""
+    assert capsys.readouterr().err == told
+
+
+class _Lottery(Wheels):
+    """Nothing but luck ends an episode."""
+
+    def outcomes(self, state, action):
+        return (self.judge(state, action, (0, 0), 1e-7), self.judge(state, action, (1, 0), 1 - 1e-7))
+
+
+def test_a_learner_that_gives_up_has_no_cost():
+    found = certificate(spec_of(_Lottery(n=1), 200))
+    assert found.learning_cost is None and 0.0 < found.optimum < 1e-4
+    assert "cautious" not in certificate_rows(found)
 
 
 def test_a_world_without_a_plan_says_so():

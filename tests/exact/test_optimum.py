@@ -119,10 +119,8 @@ class _Wall:
         return ((1.0, (macrostate[0] if macrostate[0] in (0, 4) else -1,)),)
 
 
-class _Lit:
+class _Lit(Glimpse):
     """Every room is seen, but late."""
-
-    lag = 1
 
     def seen(self, macrostate, step):
         return ((1.0, macrostate),)
@@ -130,12 +128,13 @@ class _Lit:
 
 TINY = {
     "walls": (CORRIDOR, _Wall(), 5),
-    "late": (CORRIDOR, _Lit(), 4),
+    "late": (CORRIDOR, _Lit(lag=1), 4),
+    "later": (EARLY, _Lit(lag=2), 5),
     "slipping": (dataclasses.replace(CORRIDOR, slip=0.2), _Wall(), 6),
-    "solved if no later": (EARLY, _Lit(), 5),
-    "solved if later": (LATE, _Lit(), 5),
+    "solved if no later": (EARLY, _Lit(lag=1), 5),
+    "solved if later": (LATE, _Lit(lag=1), 5),
     "in halves": (dataclasses.replace(CORRIDOR, slip=0.2, parts=2), _Wall(), 6),
-    "late, in halves": (dataclasses.replace(LATE, parts=2), _Lit(), 5),
+    "late, in halves": (dataclasses.replace(LATE, parts=2), _Lit(lag=1), 5),
     "wheel": (Wheels(n=1, slip=0.3), Glimpse(finger=0.5, lag=1), 3),
 }
 

@@ -209,7 +209,11 @@ def test_earlier_tasks_come_first_on_episodes_of_their_own(tmp_path: Path, monke
 
 def test_an_unannounced_change_stays_hidden(tmp_path: Path) -> None:
     result = do(
-        tmp_path / "run", after=("arrow_puzzle_hard", "arrow_puzzle_toward"), after_episodes=3, unannounced=True
+        tmp_path / "run",
+        after=("arrow_puzzle_hard", "arrow_puzzle_toward"),
+        after_episodes=3,
+        unannounced=True,
+        demonstrations=2,
     )
     (pupil,) = Pupil.made
     assert pupil.carried == []

@@ -21,7 +21,7 @@ from imagine_bench.tasks.graphics import choose_platform
 from imagine_bench.tasks.pick_place.world import PickWorld
 from imagine_bench.tasks.rendering import Renderer, View
 from imagine_bench.tasks.rendering import renderer as rendering
-from imagine_bench.tasks.rendering.cameras import DRAWN_GROUPS, agent_camera_view
+from imagine_bench.tasks.rendering.cameras import DRAWN_GROUPS, agent_camera_view, human_camera_view
 from imagine_bench.tasks.scenes.appearance import appearance
 
 from imagine_bench.errors import SetupError
@@ -294,6 +294,15 @@ def test_any_thread_draws_one_at_a_time(world, made):
         second.submit(camera.close).result()
     assert np.array_equal(camera.frame(world.data), before)
     camera.close()
+
+
+@pytest.mark.parametrize(
+    ("size", "quick", "quality"),
+    [((256, 256), False, (2048, 4, 28)), ((257, 1), False, (8192, 16, 64)), ((1, 257), True, (2048, 4, 28))],
+)
+def test_small_and_quick_views_for_people_are_coarse(size, quick, quality):
+    view = human_camera_view("far", *size, quick=quick)
+    assert (view.width, view.height, view.shadow_px, view.samples, view.slices) == (*size, *quality)
 
 
 def test_a_view_for_people_leaves_agents_frames_as_they_were(world):

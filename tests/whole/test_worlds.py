@@ -20,7 +20,7 @@ from whole_outputs import Expected, questions, rounded, tabulated
 
 from imagine_bench import registry
 from imagine_bench.errors import ImagineBenchError
-from imagine_bench.rules import facts, shortest_plans, tabulate
+from imagine_bench.rules import shortest_plans, tabulate
 from imagine_bench.sweep.grid import GRIDS, SUITE
 
 LARGE = 1_500  # macrostates, as of more than four cubes: they take seconds
@@ -53,7 +53,7 @@ def test_exact_facts_of_all_experiments(expected: Expected) -> None:
         tables = tabulate(spec.rules)
         if len(tables.index) > LARGE:
             continue
-        found = facts(spec.rules, spec.horizon)
+        found = spec.facts()
         compared += (task, round(found.chance_level, 9)) in kept  # levels of a split have another
         lengths = Counter(shortest_plans(tables)[tables.starts].tolist())
         plans = " ".join(f"{length}:{lengths[length]}" for length in sorted(lengths))

@@ -46,18 +46,24 @@ def test_facts_of_the_digest(rules, chance, optimal_return, mean_length):
 
 
 class _Endless:
-    n_actions, states, start_states = 1, ((0,),), ((0,),)
+    """From one of two macrostates there is no way out."""
+
+    n_actions, states, start_states = 1, ((0,), (1,)), ((0,),)
 
     def __init__(self, reward):
         self._reward = reward
 
     def outcomes(self, macrostate, action):
-        return (Outcome(1.0, (0,), self._reward, terminated=False, success=False),)
+        ends = macrostate == (0,)
+        return (Outcome(1.0, macrostate, 0.0 if ends else self._reward, terminated=ends, success=False),)
 
 
 def test_the_solver_names_what_is_wrong():
     with pytest.raises(InvalidValueError, match="Horizon 0 is too short"):
         facts(EASY, 0)
     for reward in (1.0, math.inf, math.nan):
-        with np.errstate(invalid="ignore"), pytest.raises(InvalidValueError, match="rules allow an endless"):
+        with (
+            np.errstate(invalid="ignore"),
+            pytest.raises(InvalidValueError, match=r"^From macrostate \(1,\) the rules"),
+        ):
             facts(_Endless(reward), 2)

@@ -6,13 +6,15 @@ from contextlib import closing
 
 import numpy as np
 import pytest
+from imagine_bench.tasks.arrows.scene import arrow_outline
 from imagine_bench.tasks.arrows.world import ArrowWorld
 from imagine_bench.tasks.rendering import Renderer, View
 from imagine_bench.tasks.rendering.cameras import agent_camera_view
 from imagine_bench.tasks.scenes import constants as c
 from imagine_bench.tasks.scenes.appearance import appearance
 
-from imagine_bench.preprocessing import STRIP_WIDTH
+from imagine_bench import registry
+from imagine_bench.preprocessing import STRIP_WIDTH, preprocess
 
 FIXED = appearance("clean").__class__(name="fixed", object_offset_m=0.0, object_yaw_rad=0.0)
 
@@ -49,27 +51,42 @@ def _strip_of_column(column):
     return [strip for strip, start in enumerate((0, 21, 42)) if start <= column < start + STRIP_WIDTH]
 
 
+def windows(spec):
+    """First and last column and row of each cube's own part of its channel. Shape (2, cubes, 2)."""
+    places = np.indices((64, 64), dtype=np.uint8)[::-1, ..., None].repeat(3, axis=-1)
+    shown = np.rint(255 * preprocess(spec.preprocessing)(places))
+    low, high = (end(shown, axis=(2, 3)) for end in (np.min, np.max))
+    if low.shape[1] > 3:  # above are the rows where the hand is
+        low[1] = high[1] - 17
+    return np.transpose([low, high], (0, 2, 1))
+
+
 @pytest.mark.parametrize("level", ["mild", "strong"])
-def test_each_strip_shows_its_own_cube_only(level):
-    world, generator = ArrowWorld(appearance(level)), rng()
-    camera = world.model.camera(c.AGENT_CAMERA)
-    focal_px = 32 / np.tan(np.radians(camera.fovy[0]) / 2)
-    corners = np.array([(x, y, 1.0) for x in (-1, 1) for y in (-1, 1)]) * c.CUBE_EDGE_M / 2
-    centers, extremes = [], []
-    for _ in range(200):
-        world.place((0, 1, 2, 1), generator)
+@pytest.mark.parametrize("cubes", range(1, 7))
+def test_each_channel_shows_its_own_arrow_and_pointing_hand(cubes, level):
+    """All corners of the arrow, those of the cube's top but for 3 pixels at strong, and the fingertip's column."""
+    spec = registry.task(f"arrows:cubes={cubes}")
+    world, generator = ArrowWorld(appearance(level), spec.rules.world), rng()
+    focal_px = 32 / np.tan(np.radians(world.model.camera(c.AGENT_CAMERA).fovy[0]) / 2)
+    square = np.array([(x, y) for x in (-1, 1) for y in (-1, 1)]) * c.CUBE_EDGE_M / 2
+    corners = [np.insert(outline, 2, c.CUBE_EDGE_M / 2, axis=1) for outline in (arrow_outline(), square)]
+    low, high = windows(spec)
+
+    def at_px(points_m):
+        camera = world.data.cam(c.AGENT_CAMERA)
+        x, y, z = ((points_m - camera.xpos) @ camera.xmat.reshape(3, 3)).T
+        return 32 + focal_px * np.stack([x / -z, y / z], axis=1)
+
+    for _ in range(40):
+        pointed = int(generator.integers(cubes))
+        world.place((*(0, 1, 2, 3, 0, 1)[:cubes], pointed), generator)
         world.vary(generator)
-        rotation, position = world.data.cam(c.AGENT_CAMERA).xmat.reshape(3, 3), world.data.cam(c.AGENT_CAMERA).xpos
-        for cube in range(3):
+        for cube in range(cubes):
             body = world.data.body(f"cube_{cube}")
-            seen = (corners @ body.xmat.reshape(3, 3).T + body.xpos - position) @ rotation
-            columns = 32 + focal_px * seen[:, 0] / -seen[:, 2]
-            centers.append((cube, columns.mean()))
-            extremes.append((cube, columns.min() - 21.5 * cube, columns.max() - 21.5 * cube))
-    assert all(_strip_of_column(int(column)) == [cube] for cube, column in centers)
-    spill_px = 3.5 if level == "strong" else 0.5
-    assert min(low for _, low, _ in extremes) > -spill_px
-    assert max(high for _, _, high in extremes) < 21.5 + spill_px
+            for outline, spill_px in zip(corners, (0.0, 3.0 if level == "strong" else 0.0), strict=True):
+                seen = at_px(outline @ body.xmat.reshape(3, 3).T + body.xpos)
+                assert (low[cube] - spill_px <= seen).all() and (seen <= high[cube] + 1 + spill_px).all(), cube
+        assert low[pointed, 0] + 4 < at_px(world.data.mocap_pos)[0, 0] < high[pointed, 0] - 3
 
 
 def _is_dark(frame):

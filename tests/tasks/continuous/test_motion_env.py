@@ -91,7 +91,6 @@ def test_commands_keep_the_limits_of_speed_and_range(control: str, rate_hz: floa
         {"gesture": "first"},
         {"gesture": 0.0},
         {"distractors": 2},
-        {"lag": 1},
         {"appearance": "strong"},
         {"slip": 0.5},
         {"told": True},
@@ -121,7 +120,23 @@ def test_parameters_of_a_world_mean_what_they_mean_of_macro_actions(family: str,
     hidden = "gesture" in option or option.get("told")
     assert (env.world.observed(after)[-1] == -1) == bool(hidden and not (family == "pick_place" and after[-1] == 4))
     seen = env.step(np.zeros(7, dtype=np.float32))[0]
-    assert np.array_equal(seen["state"], first["state"]) == ("lag" in option)
+    assert not np.array_equal(seen["state"], first["state"])
+
+
+def test_a_late_observation_is_that_of_so_many_events_ago() -> None:
+    """All its parts, and it stays until the next event."""
+    world = {"cubes": 1, "goal": "3", "forbid": "none"}
+    (prompt, expert), (late, _) = environment("arrows", **world), environment("arrows", lag=2, **world)
+    seen = [env.reset(seed=0, options={"macrostate": (0, 0)})[0] for env in (late, prompt)][:1]
+    for action in (0, 1, 0, 0):
+        expert.begin(action)
+        while not expert.is_done:
+            command = expert.act()
+            now, *_, info = prompt.step(command)
+            seen += [now] * bool(info["event"])
+            for name, part in late.step(command)[0].items():
+                np.testing.assert_array_equal(part, seen[max(0, len(seen) - 3)][name])
+    assert len(seen) == 5
 
 
 @pytest.mark.parametrize("family", FAMILIES)

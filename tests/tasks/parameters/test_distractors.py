@@ -54,6 +54,8 @@ def test_frames_differ_only_where_distractors_are(id_, options, states):
         hand = (usual != without_hand).any(axis=-1)
         assert hand.sum() > 40
         seen = [noisy.reset(seed=3, options={"macrostate": state})[0]]
+        drawn = noisy.task.render_macrostates(np.array([state]), "clean", np.random.default_rng(3))
+        np.testing.assert_array_equal(drawn[0], seen[0])
         for _ in range(4):
             noisy.world.vary(noisy.np_random)
             seen.append(noisy.agent_view())
@@ -84,7 +86,7 @@ def test_neither_rules_nor_physics_notice(id_):
 
 
 def test_balls_are_anywhere_on_the_screen_equally_often():
-    """Also at its edge, from which they roll back."""
+    """Also at its edge, from which they roll back: by at most 3 cm, each its own way, each in a color of its own."""
     spec = mujoco.MjSpec()
     distractors.add_distractors(spec, 4)
     model = spec.compile()
@@ -103,6 +105,12 @@ def test_balls_are_anywhere_on_the_screen_equally_often():
     for _ in range(6000):
         what.vary(data, rng)
         middles_m.extend(data.mocap_pos[:, :2].copy())
+    moves_m = np.diff(np.array(middles_m).reshape(6000, -1), axis=0)
+    assert 0.0299 < np.abs(moves_m).max() < 0.03 + 1e-9
+    assert np.abs(np.corrcoef(moves_m.T) - np.eye(6)).max() < 0.06
+    colors = {name: model.mat_rgba[model.material(name).id, :3] for name in (m.name for m in spec.materials)}
+    tiles, balls = ([colors[name] for name in colors if name.startswith(what)] for what in ("screen", "distractor"))
+    assert len(np.unique(tiles)) == 3 * 32 and len(np.unique(balls, axis=0)) == 3
     for share in (np.array(middles_m) - low_m).T / wide_m[:, None]:
         assert stats.kstest(share, "uniform").statistic < 0.02
         assert (np.minimum(share, 1.0 - share) < 0.01).mean() == pytest.approx(0.02, rel=0.25)

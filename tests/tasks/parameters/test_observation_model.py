@@ -171,7 +171,10 @@ def test_frames_of_macrostates_hide_what_the_environment_hides():
         )
         assert [np.array_equal(*pair) for pair in zip(both, seen, strict=True)] == [False, True, False]
         assert (shown_states(spec)[:, -1] == -1).any() and classes_of(spec)[-1] == len(spec.macrostate_values[-1]) + 1
-        assert spec.value_names(hidden[0])[-1] == "not seen" and spec.encoder.endswith("_hidden")
+        read = spec.as_observed(hidden[0])
+        assert read == (*hidden[0][:-1], len(spec.macrostate_values[-1]))
+        assert {spec.value_names(each)[-1] for each in (hidden[0], read)} == {"not seen"}
+        assert spec.encoder.endswith("_hidden")
 
 
 def test_a_hidden_palm_still_takes_what_is_handed_over():

@@ -68,6 +68,8 @@ def test_facts_are_those_worked_out_by_hand():
 
 @pytest.mark.parametrize("slip", [0.5, 0.99])
 def test_grips_that_slip_cost_time_and_no_return(slip):
-    """Also where they nearly always slip, so that an episode needs hundreds of macro-actions."""
-    tables = tabulate(registry.task(f"pick_place:slip={slip}").rules)
+    """Also where they nearly always slip, so that an episode needs hundreds of macro-actions, and is cut off."""
+    spec = registry.task(f"pick_place:slip={slip}")
+    assert spec.facts().mean_plan_length == pytest.approx(min(6 / (1 - slip), HORIZON), rel=0.05)
+    tables = tabulate(spec.rules)
     assert optimal_values(tables).max(axis=0)[tables.starts] == pytest.approx(8.0, abs=1e-6)

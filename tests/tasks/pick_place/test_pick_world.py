@@ -166,6 +166,7 @@ def test_an_end_against_the_draw_is_judged_from_its_beginning():
     _, reward, terminated, _, info = env.step(HAND_OVER)
     env.close()
     assert info["macrostate"].tolist() == [0, 2, 0, OPEN_PALM] and info["fault"]
+    assert info["fault_reason"] == "the scene reads (0, 2, 0, 3), the rules say (0, 1, 0, 3)"
     assert (reward, terminated, info["success"]) == (5.0, True, True)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.rules import Arrows
@@ -16,6 +18,7 @@ from imagine_bench.tasks.scenes.appearance import appearance
 from imagine_bench.tasks.scenes.arm import FINGER_JOINTS, TIP_IN_NAME
 from imagine_bench.tasks.scenes.control_views import _RGBA
 from imagine_bench.tasks.scenes.tabletop import ROOM_CAMERAS
+from scipy.spatial.transform import Rotation
 
 CUBES = (1, 2, 3, 4, 5, 6)
 PICK = 0
@@ -111,6 +114,28 @@ def test_other_views_of_a_scene_with_control_views_stay_as_they_are(scenes):
             each.place((0, 1, 2, 1), np.random.default_rng(0))
             images.append(Renderer(each.model, view).frame(each.data))
         assert np.array_equal(*images)
+
+
+def bounds_m(model, body, group):
+    """Lowest and highest corner of the drawn parts of a body, in its frame."""
+    corners = np.array(list(itertools.product((-1, 1), repeat=3)))
+    found = []
+    for index in np.flatnonzero((model.geom_bodyid == body) & (model.geom_group == group)):
+        turn = Rotation.from_quat(model.geom_quat[index], scalar_first=True)
+        box = model.geom_aabb[index]
+        found.append(model.geom_pos[index] + turn.apply(box[:3] + corners * box[3:]))
+    return np.concatenate(found).min(axis=0), np.concatenate(found).max(axis=0)
+
+
+def test_the_coarse_arm_is_where_the_arm_is(scenes):
+    """Within 25 mm, and at least three quarters as long."""
+    model = scenes(3).model
+    bodies = np.unique(model.geom_bodyid[model.geom_group == c.CONTROL_GROUP])
+    assert {model.body(body).name for body in bodies} >= {"right_l4", "right_l5", "right_hand"}
+    for body in bodies:
+        (low, high), (arm_low, arm_high) = (bounds_m(model, body, group) for group in (c.CONTROL_GROUP, c.ARM_GROUP))
+        assert (low > arm_low - 0.025).all() and (high < arm_high + 0.025).all(), model.body(body).name
+        assert (high - low).max() > 0.75 * (arm_high - arm_low).max()
 
 
 @pytest.mark.parametrize("camera", c.CONTROL_CAMERAS)
