@@ -17,7 +17,6 @@ from imagine_bench.agents.imagination.world_model import EnvironmentModel
 from imagine_bench.errors import DivergedError, InvalidValueError
 from imagine_bench.seeding import SeedTree
 
-
 _ALL = {"threshold": 0.3, "reward_threshold": 1.9, "termination_threshold": 0.2}
 """Of which each limit discards by itself."""
 

@@ -86,14 +86,16 @@ def test_an_imagined_environment_gathers_uncertainty(accumulates: bool) -> None:
     imagination, _ = make(filtered=True, model=CountingModel(change=graded), threshold=0.25, accumulates=accumulates)
     env = ImaginedVectorEnv(imagination, np.array([[i, 0] for i in range(4)], np.float32), num_envs=6, horizon=5)
     kinds = set()
-    for seed in range(2):  # a new episode has gathered nothing, whether by a reset or after an end
+    for seed in range(3):  # nothing that counts is left of an episode that ended or that a reset cuts off
         seen, _ = env.reset(seed=seed)
-        gathered = np.zeros(6)
-        for _ in range(15):
+        gathered, age = np.zeros((2, 6))
+        for _ in range(13):
             reached = gathered + UNCERTAINTY * seen[:, 0].round()
+            age = age + 1
             seen, _, _, ended, info = env.step(np.zeros(6, np.int64))
             assert info["accepted"].tolist() == (reached < 0.25).tolist()
-            gathered = np.where(ended, 0.0, reached * accumulates)
+            assert ended.tolist() == (~info["accepted"] | (age == 5)).tolist()
+            gathered, age = np.where(ended, 0.0, (reached * accumulates, age))
             kinds |= set(zip(info["accepted"].tolist(), ended.tolist(), strict=True))
     assert kinds == {(True, False), (True, True), (False, True)}
 

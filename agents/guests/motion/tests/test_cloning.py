@@ -267,7 +267,12 @@ def test_a_clone_goes_where_its_two_cameras_show_the_thing(heat_maps: int) -> No
     """One shows how far along, the other how far aside. The expert grips there in the second of three periods."""
 
     def shown(places: NDArray[np.int64]) -> NDArray[np.uint8]:
-        return (255 * (abs(np.arange(32) - places[:, None] - 2.5) < 3))[:, None, :, None].repeat(32, 1).repeat(3, 3).astype(np.uint8)
+        return (
+            (255 * (abs(np.arange(32) - places[:, None] - 2.5) < 3))[:, None, :, None]
+            .repeat(32, 1)
+            .repeat(3, 3)
+            .astype(np.uint8)
+        )
 
     places = np.random.default_rng(0).integers(2, 25, size=(100, 2)).repeat(3, axis=0)
     grips = np.tile([1.0, 0.0, 1.0], 100)
