@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 from imagine_bench.agents.imagination.settings import Settings
-from imagine_bench.agents.settings import CONFIG_GROUPS, SETS, Hyperparameters, flatten, replaced
+from imagine_bench.agents.settings import CONFIG_GROUPS, INSIDE, SETS, Hyperparameters, flatten, replaced
 from imagine_bench_regression import settings as regressor_settings
 
 from imagine_bench import registry
@@ -119,6 +119,32 @@ def test_sizes_that_no_network_has_are_refused() -> None:
 def test_wrong_values_are_named_with_what_is_allowed(name: str, value: Any, message: str) -> None:
     with pytest.raises((InvalidValueError, UnknownNameError), match=message):
         resolve("fast", {name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "allowed", "refused"),
+    [
+        ("controller.target_rate", [1e-9, 1.0], [0.0, 1.01]),
+        ("controller.learning_rate", [1e-9, 1e6], [0.0, 1.01e6]),
+        ("controller.discount", [0.0, 1.0], [-0.01, 1.01]),
+        ("controller.updates_per_step", [0, 1000], [-1, 1001]),
+        ("controller.batch_size", [1, 10_000], [0, 10_001]),
+        ("controller.hidden", [[1], [8192] * 16], [[0], [8193], [1] * 17, [True], 1]),
+        ("memory.real", [1, 5_000_000], [0, 5_000_001, True, 1.0]),
+        ("memory.priority", [0, 1e6], [-0.01, 1.01e6, None, True]),
+        ("model.dropout", [0.0, 1 / 256, 255 / 256], [0.003, 0.997]),
+        ("model.updates_per_step", [1, 1000], [0, 1001]),
+        ("model.max_norm", [None, 1e-9, 1e6], [0.0, "3"]),
+    ],
+)
+def test_a_range_ends_where_it_says(name: str, allowed: list[Any], refused: list[Any]) -> None:
+    for value in allowed:
+        found = flatten(resolve("published", {name: value}))[name]
+        assert found == (tuple(value) if isinstance(value, list) else value)
+    for value in refused:
+        with pytest.raises(InvalidValueError, match=name):
+            resolve("published", {name: value})
+    assert [INSIDE.holds(value) for value in (0.0, 1e-9, 0.999, 1.0)] == [False, True, True, False]
 
 
 @pytest.mark.parametrize("group", CONFIG_GROUPS)

@@ -128,11 +128,14 @@ def test_networks_err_by_the_sum_of_the_causes(toy: RegressionRun, tmp_path: Pat
     """Of any network, however bad: the measured error is the sum of the terms of equation 4.8, but for sampling."""
     result = result_of(TOY, toy, tmp_path)
     rows = csv.DictReader(io.StringIO(report_page(result).files["decomposition.csv"]))
-    for pair, row in zip(result.pairs.values(), itertools.islice(rows, 1, None, 3), strict=True):
-        region = {name: each[:, abs(pair.first["x"]) <= 10] for name, each in squared_error_terms(pair).items()}
-        left = region.pop("measured") - sum(region.values())
-        written = f"{number(left.mean())} ± {number(1.96 * left.std() / left.size**0.5)}"
-        assert (row[""], row["measured − sum"]) == (f"{pair.label}: region", written)
+    for pair in result.pairs.values():
+        x = pair.first["x"]
+        for words, here in (("data", abs(x) <= 30), ("region", abs(x) <= 10), ("beyond", x > 30)):
+            parts = {name: each[:, here] for name, each in squared_error_terms(pair).items()}
+            means = {name: number(each.mean()) for name, each in parts.items()}
+            left = parts.pop("measured") - sum(parts.values())
+            written = f"{number(left.mean())} ± {number(1.96 * left.std() / left.size**0.5)}"
+            assert next(rows) == {"": f"{pair.label}: {words}", **means, "measured − sum": written}
         terms = squared_error_terms(pair)
         rest = terms.pop("measured") - sum(terms.values())
         error = rest.std() / np.sqrt(rest.size)
@@ -171,7 +174,7 @@ def robot() -> RegressionRun:
     for part in ("decision", "disc"):
         arrays[f"{part}/error"] = np.tile([0.1, 0.2, 0.6], (2, 4, 1))
         for name in SCORES:
-            place = {"aleatoric": 1, "modal": 2}.get(name, 0)
+            place = {"aleatoric": 1, "nll": 1, "modal": 2}.get(name, 0)
             arrays[f"{part}/{name}"] = np.tile(np.roll([0, 1, 2], place), (2, 4, 1))
     names = [
         "coverage_0.5",
@@ -198,6 +201,8 @@ def test_table_4_1_sums_the_errors_of_the_places_of_least_uncertainty(tmp_path: 
     stds = [np.sqrt(maps[f"map/{kind}"][0].T) for kind in ("epistemic", "modal", "aleatoric")]
     np.testing.assert_allclose(drawn[1:12], [maps["map/error"][0], maps["map/stationarity"][0], *np.concatenate(stds)])
     page = report_page(result)
+    for said, where in zip(page.answers, ("within reach", "anywhere on the disc"), strict=True):
+        assert re.search(rf"1000 samples, .* places {where}: .* 0\.33 .*by epistemic .* 0\.67 .*by negative log", said)
     (image,) = [image for section in page.sections for image in section.images]
     assert image.name == "figures_4_2_4_3_mc_dropout_1000" and len(image.png) > 10_000
     assert "thesis,1000,3.89 (0.67)" in page.files["choices.csv"], "the thesis' own is below"

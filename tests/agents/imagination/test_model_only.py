@@ -94,11 +94,12 @@ def test_training_twice_from_equal_experience_gives_equal_bits() -> None:
 
 
 def test_imagined_episodes_begin_where_real_ones_did() -> None:
-    agent = made(**{"imagination.depth": 1})
+    agent = made(**{"imagination.depth": 1, "controller.updates_per_step": 3})
     for episode in range(3):
         agent.observe(transition(episode, 0, 0.0, 4), episode=episode)
         agent.observe(transition(4, 0, 0.0, 5), episode=episode)
     train_in_model(agent)
+    assert agent.updates == 6 * (3 + 2) + 8 * 3, "as many a step of an imagined episode as of a real one"
     begun = agent.state().arrays["model_only/memory/z"]
     distance = np.linalg.norm(begun[:, None] - CODES[:3].numpy()[None], axis=-1).min(axis=1)
     assert distance.shape == (8,) and distance.max() < 0.5, "drawn from the posteriors of starts, whose sigma is 0.05"
@@ -138,7 +139,7 @@ def test_a_learner_keeps_its_dynamics_network_and_nothing_else(make) -> None:  #
     weights = {name for name in before if name.startswith(parts) and ".weight" in name and name.endswith("/weight")}
     kept = {name for name in weights if np.array_equal(before[name], after[name])}
     assert kept == {name for name in weights if name.startswith("imagination/model/dynamics.")} < weights
-    assert len(learner.real) == len(learner.imagination.memory) == learner.steps == 0
+    assert len(learner.real) == len(learner.imagination.memory) == learner.steps == learner.updates == 0
     assert not any(name.startswith("loss/") for name in learner.diagnostics()), "of a task that is over"
     assert learner.imagination.filter.threshold == 99.0
     first, second = (live(each, range(5), np.random.default_rng(1)) for each in (learner, resumed))

@@ -17,6 +17,9 @@ from imagine_bench.agents.imagination.world_model import EnvironmentModel
 from imagine_bench.errors import DivergedError, InvalidValueError
 from imagine_bench.seeding import SeedTree
 
+_ALL = {"threshold": 0.3, "reward_threshold": 1.9, "termination_threshold": 0.2}
+"""Of which each limit discards by itself."""
+
 
 @pytest.mark.parametrize(
     ("model", "filtered", "limits", "kept"),
@@ -32,6 +35,7 @@ from imagine_bench.seeding import SeedTree
         ({"torn_at": 5}, True, {"termination_threshold": 0.2}, 4),
         ({"torn_at": 5}, True, {"termination_threshold": float(np.float32(0.3))}, 10),
         ({"end_at": 4}, True, {"termination_threshold": 0.0}, 4),  # a certain end
+        *(({which: 3}, True, _ALL, 2) for which in ("uncertain_at", "reward_uncertain_at", "torn_at")),
     ],
 )
 def test_rollouts_run_until_they_end_are_full_or_too_uncertain(

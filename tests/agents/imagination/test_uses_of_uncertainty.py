@@ -58,13 +58,14 @@ def test_gathered_uncertainty_ends_rollouts_and_weighs_transitions(
         np.testing.assert_allclose(rows["weight"], confidence(depth, accumulates), rtol=1e-4)
 
 
+def graded(sound: Mixture, z: torch.Tensor) -> Mixture:
+    """From (i, c) i times as uncertain."""
+    more = (unsure(sound, z).means - sound.means) * z[:, 0, None, None].sqrt()
+    return dataclasses.replace(sound, means=sound.means + more)
+
+
 def test_what_a_rollout_has_gathered_is_its_own() -> None:
-    """Of rollouts that begin in (i, 5) and are i times as unsure of a step, the unsure end early."""
-
-    def graded(sound: Mixture, z: torch.Tensor) -> Mixture:
-        more = (unsure(sound, z).means - sound.means) * z[:, 0, None, None].sqrt()
-        return dataclasses.replace(sound, means=sound.means + more)
-
+    """Of rollouts that begin in (i, 5) the unsure end early."""
     gathering = {"threshold": 0.35, "accumulates": True, "start_states": "replayed", "breadth": 60}
     imagination, _ = imagined(CountingModel(change=graded), filtered=True, states=4, **gathering)
     z = imagination.memory.arrays()["z"].round()
@@ -81,13 +82,22 @@ def test_model_only_training_gathers_and_weighs_uncertainty() -> None:
 
 @accumulating
 def test_an_imagined_environment_gathers_uncertainty(accumulates: bool) -> None:
-    imagination, _ = make(filtered=True, model=CountingModel(change=unsure), threshold=0.35, accumulates=accumulates)
-    env = ImaginedVectorEnv(imagination, np.zeros((1, 2), np.float32), num_envs=2, horizon=10)
-    episode = [True] * 3 + [False] if accumulates else [True] * 10
-    for seed in range(2):  # a new episode has gathered nothing, whether by a reset or after an end
-        env.reset(seed=seed)
-        accepted = [env.step(np.zeros(2, np.int64))[4]["accepted"].all() for _ in range(2 * len(episode))]
-        assert accepted == 2 * episode
+    """Each episode its own: side by side they begin in (i, 0), and are cut after 5 steps or where they are unsure."""
+    imagination, _ = make(filtered=True, model=CountingModel(change=graded), threshold=0.25, accumulates=accumulates)
+    env = ImaginedVectorEnv(imagination, np.array([[i, 0] for i in range(4)], np.float32), num_envs=6, horizon=5)
+    kinds = set()
+    for seed in range(3):  # nothing that counts is left of an episode that ended or that a reset cuts off
+        seen, _ = env.reset(seed=seed)
+        gathered, age = np.zeros((2, 6))
+        for _ in range(13):
+            reached = gathered + UNCERTAINTY * seen[:, 0].round()
+            age = age + 1
+            seen, _, _, ended, info = env.step(np.zeros(6, np.int64))
+            assert info["accepted"].tolist() == (reached < 0.25).tolist()
+            assert ended.tolist() == (~info["accepted"] | (age == 5)).tolist()
+            gathered, age = np.where(ended, 0.0, (reached * accumulates, age))
+            kinds |= set(zip(info["accepted"].tolist(), ended.tolist(), strict=True))
+    assert kinds == {(True, False), (True, True), (False, True)}
 
 
 def test_an_environment_that_cannot_weigh_by_confidence_refuses_it() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 import pickle
 from collections.abc import Callable
 from typing import Any
@@ -12,11 +11,10 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from counting_model import CountingModel, RuledModel, make, ruled
+from counting_model import RuledModel, ruled
 from fake_latents import CODES, built, frame, live
 from imagine_bench.agents.imagination import agent as imagination_agents
 from imagine_bench.agents.imagination.agent import ImaginingAgent
-from imagine_bench.agents.imagination.mixture import Mixture
 from imagine_bench.agents.imagination.vector_env import ImaginedEnv, ImaginedVectorEnv, imagined_env
 from same_values import assert_same
 
@@ -92,34 +90,6 @@ def test_a_discarded_transition_is_cut_and_not_shown(filtered: bool) -> None:
         assert np.array_equal(info["final_obs"][index], before[index])
         assert not info["final_info"]["accepted"][index]
     assert set(read([*after[cut], before[0]])) <= set(RULES.start_states)
-
-
-def evenly_uncertain(sound: Mixture, z: torch.Tensor) -> Mixture:
-    """The weight samples of each prediction have a variance of 1."""
-    spread = torch.linspace(-1.0, 1.0, len(sound.means))
-    means = sound.means.clone()
-    means[..., 0] += (spread / spread.std(correction=0))[:, None, None]
-    return dataclasses.replace(sound, means=means)
-
-
-@pytest.mark.parametrize("accumulates", [False, True])
-def test_an_episode_after_a_reset_lasts_as_long_as_the_first(accumulates: bool) -> None:
-    """Nothing that counts in an episode is left of those that a reset cuts off: neither steps nor uncertainty.
-
-    A step has an uncertainty of 1. If steps accumulate, the third one exceeds the threshold; else an episode has four.
-    """
-    changes = {"accumulates": accumulates, "threshold": 2.5}
-    imagination, _ = make(filtered=True, model=CountingModel(change=evenly_uncertain), **changes)
-    env = ImaginedVectorEnv(imagination, np.zeros((1, 2), np.float32), num_envs=3, horizon=4)
-    lengths = []
-    for before in (0, 1, 2):
-        env.reset(seed=0)
-        for _ in range(before):
-            assert not env.step(np.zeros(3, np.int64))[3].any()
-        env.reset()
-        cut = [env.step(np.zeros(3, np.int64))[3].tolist() for _ in range(4)]
-        lengths.append(cut.index([True] * 3) + 1)
-    assert lengths == [3 if accumulates else 4] * 3
 
 
 @pytest.fixture(scope="module")

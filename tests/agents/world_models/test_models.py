@@ -87,13 +87,38 @@ def test_rewards_are_in_the_unit_of_the_data(name: str, monkeypatch: pytest.Monk
         assert found.p_ended.max() < 0.05
 
 
+_SLOW = ("mdn_thesis", "mdn_whole_layer")
+"""Sixty updates at the settings of the thesis teach little."""
+
+
+@pytest.mark.parametrize("name", [name for name in LEARNED if name not in ("copy", *_SLOW)])
+def test_what_is_learned_of_a_frame_is_what_followed_it(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In episodes of three frames, of which leaving the first costs 7 and leaving the second 1."""
+    monkeypatch.setattr(latent, "UPDATES", 60)
+    monkeypatch.setattr(convolutional, "_STEPS", 60)
+    frames = data().frames[[0, 12, 30]]
+    rng = np.random.default_rng(0)
+    one = {
+        "frames": frames, "rewards": [-7.0, -1.0], "terminated": [False] * 2, "truncated": [False, True],
+        "success": False, "action_masks": np.ones((3, 6), dtype=np.int8),
+    }  # fmt: skip
+    model = fitted(name, joined([{**one, "actions": rng.integers(6, size=2)} for _ in range(40)]))
+    found = model.imagine(frames[:2, None], np.array([[0], [3]]), 4, rng).rewards
+    assert found is not None
+    dear, cheap = found.mean(axis=(1, 2))
+    assert dear < cheap - 2.0
+
+
 @pytest.mark.usefixtures("quick")
-@pytest.mark.parametrize("name", ["mdn_dropout", "mdn_ensemble", "mdn_thesis", "gaussian"])
+@pytest.mark.parametrize(
+    "name", ["mdn_dropout", "mdn_ensemble", "mdn_thesis", "gaussian", "ensemble_spread", "ensemble_round_trip"]
+)
 def test_latent_models_offer_three_uncertainties(name: str) -> None:
     found = imagined(fitted(name))
     assert found.epistemic is not None and found.aleatoric is not None and found.modal is not None
     assert (found.epistemic > 0).all() and (found.aleatoric > 0).all()
     assert (found.modal == 0).all() == (name == "gaussian")
+    assert (found.accepted is None) == name.startswith("ensemble_"), "a filter would compare another uncertainty"
 
 
 @pytest.mark.usefixtures("quick")

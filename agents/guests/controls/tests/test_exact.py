@@ -25,11 +25,11 @@ from imagine_bench.running.bench import plan
 STATES = 6
 GOAL = 5
 HALF = 2
-"""Action 2 moves by two with probability 1/2, and else not at all; others by their number."""
+"""Action 2 moves by two with probability 1/2, else by three or not at all; others move by their number."""
 
 
 def outcomes(state: tuple[int, ...], action: int) -> tuple[Outcome, ...]:
-    moves = [(0.5, 2), (0.5, 0)] if action == HALF else [(1.0, action)]
+    moves = [(0.5, 2), (0.25, 3), (0.25, 0)] if action == HALF else [(1.0, action)]
     return tuple(
         Outcome(p, ((state[0] + by) % STATES,), 70.0 if (state[0] + by) % STATES == GOAL else -1.0,
                 (state[0] + by) % STATES == GOAL, (state[0] + by) % STATES == GOAL)
@@ -82,8 +82,10 @@ def test_what_is_imagined_is_of_the_rules_alone() -> None:
         assert (then, reward, bool(ended)) in {
             (*o.macrostate, o.reward, o.terminated) for o in outcomes((int(state),), int(action))
         }
-    by_chance = (after == before)[rows["action"] == HALF]
-    assert abs(by_chance.mean() - 0.5) < 4.0 * 0.5 / np.sqrt(len(by_chance)), "outcomes have their probabilities"
+    by_chance = ((after - before) % STATES)[rows["action"] == HALF]
+    shares = np.bincount(by_chance, minlength=4) / len(by_chance)
+    error = 4.0 * 0.5 / np.sqrt(len(by_chance))
+    assert shares == pytest.approx([0.25, 0.0, 0.5, 0.25], abs=error), "outcomes have their probabilities"
 
 
 def test_a_rollout_goes_on_from_what_it_reached() -> None:

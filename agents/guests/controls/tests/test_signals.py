@@ -29,29 +29,24 @@ def bits(variance: float) -> float:
     return 0.5 * math.log2(2.0 * math.pi * math.e * variance)
 
 
-def lost(means: list[float], variances: list[float]) -> float:
+@pytest.mark.parametrize(
+    ("means", "variances", "fused", "mean"),
+    [
+        ([0.0, 1.0], [1.0, 1.0 / 3.0], 0.5, 0.75),  # precisions 1 and 3
+        ([1.0] * 3, [0.25] * 3, 0.25, 1.0),  # nothing is lost
+        ([-1e6, 0.0, 1e6], [0.25] * 3, 0.25, 0.0),  # no more than the prediction itself leaves open
+        ([0.0, 0.1], [10.0] * 2, 10.0, 0.05),  # much noise hides disagreement
+        ([0.0, 0.3], [1.0] * 2, 1.0, 0.15),
+    ],
+)
+def test_lost_information_is_that_by_hand(
+    means: list[float], variances: list[float], fused: float, mean: float
+) -> None:
     """Of members that predict one number each."""
+    epistemic = sum((each - mean) ** 2 for each in means) / len(means)
+    left = fused * epistemic / (fused + epistemic) + 1e-12
     given = (torch.tensor(values, dtype=torch.float64)[:, None] for values in (means, variances))
-    return lost_information(*given).item()
-
-
-def test_lost_information_of_two_gaussians_is_that_by_hand() -> None:
-    """Variances 1 and 1/3: precisions 1 and 3, fused 1/2; means 0 and 1: fused 1/2 * (0 + 3) / 2 = 3/4."""
-    epistemic = ((3 / 4) ** 2 + (1 / 4) ** 2) / 2
-    left = 0.5 * epistemic / (0.5 + epistemic)
-    assert lost([0.0, 1.0], [1.0, 1.0 / 3.0]) == pytest.approx(bits(left), abs=1e-6)
-
-
-def test_members_lose_information_as_they_disagree() -> None:
-    assert lost([1.0] * 3, [0.25] * 3) < -15.0
-    apart = lost([-1e6, 0.0, 1e6], [0.25] * 3)
-    assert apart == pytest.approx(bits(0.25), abs=1e-6), "no more is lost than the prediction itself leaves open"
-
-
-def test_noise_is_no_loss_and_disagreement_is() -> None:
-    some, much = (lost([0.0, 0.1], [variance] * 2) for variance in (1.0, 10.0))
-    assert much - some < 0.01, "much noise hides the little disagreement, and little is lost"
-    assert lost([0.0, 0.3], [1.0] * 2) > some + 1.0
+    assert lost_information(*given).item() == pytest.approx(bits(left), abs=1e-6)
 
 
 def test_mixtures_count_with_their_mean_and_whole_variance() -> None:

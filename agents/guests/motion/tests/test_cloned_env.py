@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import functools
+from collections import Counter
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from imagine_bench.tasks.scenes.arm import FINGER_JOINTS
-from imagine_bench_motion.cloned_env import BUNDLED, CloneExecutedEnv
+from imagine_bench_motion.cloned_env import BUNDLED, CloneExecutedEnv, ControlPeriod, carry_out
 from imagine_bench_motion.cloning import Clone
+from imagine_bench_motion.instruction import GO_BACK
 from imagine_bench_motion.levels import make_agent
+from imagine_bench_motion.skills import HOME_COMMAND
+from imagine_bench_motion.trials import MOST_PERIODS
 from scripted_clone import ScriptedClone
 
 from imagine_bench.errors import InvalidValueError
@@ -69,6 +75,33 @@ def test_the_clone_turns_the_cube_of_its_instruction() -> None:
             assert (reward, terminated, info["is_success"]) == (expected.reward, expected.terminated, expected.success)
             assert 1.0 < info["sim_time_s"] < 4.5
     assert done >= 4
+
+
+@pytest.mark.parametrize(
+    ("event", "home", "over", "lasts"),
+    [
+        (0, 0, 0, {"turn": MOST_PERIODS, GO_BACK: 12, "home": 25}),
+        (40, 55, 0, {"turn": 40, GO_BACK: 12, "home": 3}),
+        (40, 30, 0, {"turn": 40, GO_BACK: 12, "home": 25}),
+        (0, 0, 10, {"turn": 10}),
+        (40, 0, 45, {"turn": 40, GO_BACK: 5}),
+        (40, 0, 54, {"turn": 40, GO_BACK: 12, "home": 2}),
+    ],
+)
+def test_a_skill_lasts_to_its_event_then_lifts_the_hand_and_goes_home(
+    event: int, home: int, over: int, lasts: dict[str, int]
+) -> None:
+    """The periods of each part, where an event, an arm at home or the end comes after so many in all; 0: never."""
+    told: list[str] = []
+    clone: Any = SimpleNamespace(begin=lambda words: setattr(clone, "act", lambda seen: words))
+
+    def period(command: Any) -> ControlPeriod:
+        told.append(command if isinstance(command, str) else "home")
+        joints_rad = HOME_COMMAND[:-1] + 0.01 * (len(told) != home)
+        return ControlPeriod({"proprio": joints_rad}, len(told) == event, len(told) == over)
+
+    last = carry_out(clone, "turn", {}, period)
+    assert Counter(told) == lasts and last.over == (over > 0)
 
 
 def test_a_macro_action_that_turns_nothing_counts_as_one_that_slipped() -> None:

@@ -262,6 +262,43 @@ def test_training_follows_its_seed_and_comes_nearer_to_the_expert() -> None:
         assert torch.equal(mine, other)
 
 
+@pytest.mark.parametrize("heat_maps", [0, 4])
+def test_a_clone_goes_where_its_two_cameras_show_the_thing(heat_maps: int) -> None:
+    """One shows how far along, the other how far aside. The expert grips there in the second of three periods."""
+
+    def shown(places: NDArray[np.int64]) -> NDArray[np.uint8]:
+        return (
+            (255 * (abs(np.arange(32) - places[:, None] - 2.5) < 3))[:, None, :, None]
+            .repeat(32, 1)
+            .repeat(3, 3)
+            .astype(np.uint8)
+        )
+
+    places = np.random.default_rng(0).integers(2, 25, size=(100, 2)).repeat(3, axis=0)
+    grips = np.tile([1.0, 0.0, 1.0], 100)
+    data = DemonstrationData(
+        images={"front": shown(places[:, 0]), "hand": shown(places[:, 1])},
+        numbers=np.random.default_rng(1).normal(size=(300, 1)).astype(np.float32),
+        instructions=np.tile(["turn", "turn", GO_BACK], 100),
+        commands=np.column_stack([places, grips]).astype(np.float32),
+        hand_m=np.column_stack([np.where(grips[:, None], 0.0, places), grips]).astype(np.float32),
+        episode=np.arange(100).repeat(3),
+    )
+    settings = Training(updates=150, encoder_updates=150, shift_px=1)
+    policy = train(
+        data, seed=0, observation="front,hand,proprio", settings=settings, layout={"heat_maps": heat_maps, "chunk": 1}
+    )
+    for asked in itertools.product((5, 20), repeat=2):
+        along, aside = shown(np.array(asked))
+        policy.begin("turn")
+        found = policy.act({"front": along, "hand": aside, "proprio": np.zeros(1, np.float32)})
+        assert found[:2] == pytest.approx(asked, abs=5.0)
+    assert policy.about | {"cpu_s": 0.0} == {
+        "world": "", "observation": "front,hand,proprio", "size_px": 32, "demonstrations": 100, "periods": 300,
+        "seed": 0, "training": asdict(settings), "cpu_s": 0.0,
+    }  # fmt: skip
+
+
 def test_a_saved_clone_acts_as_before(tmp_path: Path) -> None:
     clone().save(tmp_path / "skill.pt")
     again = Clone.load(tmp_path / "skill.pt")

@@ -20,7 +20,7 @@ from imagine_bench_motion.judge.judgement import SIMULATOR, MotionJudgement, jud
 from imagine_bench_motion.judge.labelled import Labelled
 from imagine_bench_motion.judge.no_change import NoChange
 from imagine_bench_motion.judge.questions import AnsweredMotions, MotionQuestions, MotionSource, moved, moving_actions
-from imagine_bench_motion.judge.recurrent import MotionNetwork
+from imagine_bench_motion.judge.recurrent import MotionNetwork, images, patches
 from imagine_bench_motion.judge.report import motion_rows, motion_tables
 from imagine_bench_motion.judge.scores import MotionScores, Simulator, score
 
@@ -101,6 +101,10 @@ def test_questions_are_the_same_after_they_were_in_a_file() -> None:
     again = MotionQuestions.of(arrays).arrays()
     assert arrays.keys() == again.keys()
     assert all(np.array_equal(arrays[name], again[name]) for name in arrays)
+    planned = questions("arrows").planned
+    learned = vars(planned.first(3))
+    assert learned.keys() == {"before", "after", "actions", "lengths", "labels"}, "no answers"
+    assert all(np.array_equal(part, getattr(planned, name)[:3]) for name, part in learned.items())
 
 
 def frames_of(*states: tuple[int, ...]) -> Frame:
@@ -299,6 +303,9 @@ def test_a_network_follows_its_generator_until_a_motions_end() -> None:
         imagined = network(frames, actions, lengths)
         assert torch.equal(imagined, again(frames, actions, lengths)), "the global generator draws nothing"
         torch.testing.assert_close(imagined, network(frames, longer, lengths))
+    rows = torch.rand(2, 8, 12, 3, generator=torch.Generator().manual_seed(0))
+    cut = patches(rows)
+    assert torch.equal(cut[1, 1, 2], rows[1, 4:8, 8:12].flatten()) and torch.equal(images(cut), rows)
 
 
 def test_a_labelled_model_learns_each_motion_and_gives_images_of_the_scenes_size() -> None:

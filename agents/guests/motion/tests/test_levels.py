@@ -13,6 +13,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from imagine_bench.tasks.continuous.spec import make_arrows
 from imagine_bench_motion import flat
 from imagine_bench_motion.__main__ import main
 from imagine_bench_motion.cloned_env import BUNDLED
@@ -68,7 +69,8 @@ class _Rememberer:
         return 0
 
     def observe(self, transition: Any, *, episode: int) -> None:
-        self.told.append("learn")
+        frames = (each.frame.item(0) for each in (transition.observation, transition.next_observation))
+        self.told.append((episode, *frames, transition.truncated))
 
     def train_in_model(self) -> bool:
         self.left -= 1
@@ -90,15 +92,23 @@ def test_an_agent_hears_of_episodes_and_trains_before_tests() -> None:
         agent.told.append(seed)
         return frame, info(0)
 
-    steps = iter([info(1), info(1), info(1, fault=True), info(2, fault=True)] * 2)
+    def step(action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        place, told = next(steps)
+        return np.full_like(frame, place), 0.0, False, False, told
+
+    each = [info(1), info(1), info(1, fault=True), info(2, fault=True)]
+    steps = iter([*enumerate(each, start=1)] * 2)
     frame = np.zeros((64, 64, 3), dtype=np.uint8)
     agent: Any = _Rememberer()
-    env: Any = SimpleNamespace(reset=reset, step=lambda _: (frame, 0.0, False, False, next(steps)))
+    env: Any = SimpleNamespace(reset=reset, step=step)
     test_env: Any = SimpleNamespace(reset=reset, step=lambda _: (frame, 0.0, True, False, info(0)))
     curve = learn(env, test_env, agent, budgets=[1, 2], tests=2, horizon=4, seed=3, told=lambda point: None)
-    trained = ["begin", *["explore", "learn"] * 4]
+    trained = [
+        ["begin", *(word for place in range(4) for word in ("explore", (episode, place, place + 1, place == 3)))]
+        for episode in (1, 2)
+    ]  # the horizon truncates
     tested = [10**9, "begin", "test", 10**9 + 1, "begin", "test"]
-    assert agent.told == [300_001, *trained, "model", "model", "model", *tested, 300_002, *trained, *tested]
+    assert agent.told == [300_001, *trained[0], *["model"] * 3, *tested, 300_002, *trained[1], *tested]
     found = [(point.macro_actions, point.nothing, point.faults, point.robot_s) for point in curve]
     assert found == [(4, 1, 2, 8.0), (8, 2, 4, 16.0)]
 
@@ -145,6 +155,19 @@ def test_an_agents_own_settings_reach_it() -> None:
     usual: Any = make_agent("dqn", spec, 0)
     other: Any = make_agent("dqn:controller.discount=0.5", spec, 0)
     assert other.settings.controller.discount == 0.5 != usual.settings.controller.discount
+    first, again, second = (make_agent("random", spec, seed).state().values for seed in (0, 0, 1))
+    assert first == again != second
+
+
+@pytest.mark.parametrize("slip", [0.0, 0.25])
+def test_grips_slip_as_often_as_is_said_and_no_rule_knows(slip: float) -> None:
+    by_planner, by_clone = (environment(execution, cubes=3, slip=slip) for execution in ("planner", "clone"))
+    assert by_planner.env.unwrapped.task.rules.world.slip == slip
+    assert by_planner.rules.world.slip == by_clone.rules.world.slip == 0.0
+    same = make_arrows(slip=slip, horizon=10, control="joint", observation=by_clone.env.clone.observation)
+    for env in (same, by_clone.env.motion):
+        env.reset(seed=0)
+    by_clone.env.motion.set_state(same.get_state())  # which would refuse the state of another world
 
 
 def test_a_kept_file_names_its_clone_and_its_world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -166,6 +167,25 @@ def test_the_library_sees_rewards_of_about_one(world: gymnasium.Env[Any, Any]) -
         env.reset(seed=5)
         rewards.extend(float(env.step(action)[1]) for action in (0, 1, 2))
     assert all(paid) and seen == pytest.approx([0.04 * reward for reward in paid]), "the task's, divided by 25"
+
+
+@pytest.mark.parametrize(("agent", "most"), [("sb3_dqn", 10), ("sb3_dqn_imagined", 10 + 4 * 3)])
+def test_a_loop_makes_as_many_steps_as_its_episodes_may_have(
+    agent: str, most: int, world: gymnasium.Env[Any, Any]
+) -> None:
+    """Four imagined episodes of at most three steps follow each real one; each seed of a run is one of the library."""
+    from imagine_bench_peers.sb3 import ImaginingLibraryAgent, LibraryAgent
+
+    kind: Any = ImaginingLibraryAgent if agent in IMAGINING else LibraryAgent
+    seeds = set()
+    for seed in (0, 1):
+        kind(context_of(replace(spec(agent), seed=seed)), f"{__name__}:LISTENER").train(
+            world, episodes=100, horizon=10, on_episode=lambda solved, length: False
+        )
+        seeds.add(LISTENER.call_args.kwargs["seed"])
+        assert LISTENER.return_value.learn.call_args.args == (100 * most,)
+        assert LISTENER.call_args.kwargs["exploration_fraction"] * 100 * most == pytest.approx(600)
+    assert len(seeds) == 2
 
 
 @pytest.mark.parametrize("agent", ["sb3_dqn", "sb3_qrdqn", LATENTS, "sb3_ppo_latents", *IMAGINING])

@@ -93,7 +93,9 @@ class Ring(gymnasium.Env[Any, Any]):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self.state = (self.state + int(action)) % 6
         self.steps = self.steps + 1
-        return frame(self.state), float(self.state == 0), False, self.steps == 2, {"is_success": self.state == 0}
+        over = self.steps == 2
+        found = self.state == 0
+        return frame(self.state), float(found), over and found, over and not found, {"is_success": found}
 
 
 def test_imagined_episodes_follow_real_ones_once_they_may() -> None:
@@ -105,6 +107,7 @@ def test_imagined_episodes_follow_real_ones_once_they_may() -> None:
     rng = np.random.default_rng(0)
     kinds = ""
     real = 0
+    ends = set[tuple[bool, bool]]()
     states = {tuple(row) for row in CODES[:6].tolist()}
     for episode in range(14):
         before, _ = env.reset(seed=None if episode else 0)
@@ -121,11 +124,12 @@ def test_imagined_episodes_follow_real_ones_once_they_may() -> None:
                 rows = learner.real.arrays()
                 assert tuple(seen.tolist()) in states and np.array_equal(rows["next_mu"][-1], seen)
                 assert np.array_equal(rows["mu"][-1], before)
-                assert (rows["action"][-1], rows["reward"][-1], rows["terminated"][-1]) == (action, reward, 0.0)
+                assert (rows["action"][-1], rows["reward"][-1], rows["terminated"][-1]) == (action, reward, terminated)
+                ends |= {(terminated, truncated)}
             before = seen
         kinds += "i" if info["imagined"] else "r"
         assert length == 2 if kinds[-1] == "r" else length <= 3
-    assert kinds == "r" + "riii" * 3 + "r"
+    assert kinds == "r" + "riii" * 3 + "r" and ends == {(False, False), (True, False), (False, True)}
     assert learner.real.added == real == 10 and learner.updates == 10 * 2, "imagined ones teach the model nothing"
     assert 0.0 <= learner.meters.read()["imagination/acceptance_rate"] <= 1.0
 

@@ -100,6 +100,8 @@ def test_variances_are_those_of_what_weight_samples_draw(name: str) -> None:
     inputs = rng.normal(size=(2, 20, 1))
     predicted = both.predict(inputs, rng)
     np.testing.assert_allclose(predicted.mean[1], alone.predict(inputs[1:], rng).mean[0], rtol=1e-4)
+    among_many = np.concatenate([np.zeros((2, 256, 1)), inputs], axis=1)  # more rows than are predicted at a time
+    np.testing.assert_allclose(both.predict(among_many, rng).mean[:, 256:], predicted.mean, rtol=1e-5)
     variance = predicted.scores["total"][..., None]
     assert 10.0 < np.sqrt(variance).mean() < 250.0
     assert abs(predicted.mean.mean() - 300.0) < 100.0
