@@ -311,21 +311,8 @@ def test_every_number_of_the_page_leads_to_its_episodes(row: Path, tmp_path: Pat
     assert (page.parent / "board.csv").read_text().count("\n") == 1 + 4
 
 
-def test_rows_of_one_player_have_a_curve_each_and_their_mean_cost(row: Path) -> None:
-    shutil.copytree(row, row.with_name("a_copy"))
-    opened = OpenRow(row)
-    for price, cpu_s in zip(opened.card["claimed"]["prices"], (10.0, 20.0, 30.0, 60.0), strict=True):
-        price["train_cpu_s"] = cpu_s
-    opened.write()
-    section, *_ = board_page(check(row.parents[1])).sections
-    draw = section.images[0].draw
-    assert draw is not None and [line.get_label() for line in draw().axes[0].lines] == ["table", row.name]
-    cells = dict(zip(section.tables[0].header, zip(*section.tables[0].rows, strict=True), strict=True))
-    assert cells["CPU s (claimed)"][1] == "40.0", "of two seeds after 9 episodes"
-
-
 def test_the_row_that_solves_most_after_its_last_budget_comes_first(row: Path) -> None:
-    """Its figures are means over seeds, in the table and in the curve."""
+    """Figures are means over seeds, in the table and in the curve; rows of one player have a curve each."""
     shutil.copytree(row, row.with_name("a_copy"))
     told = {"a_copy": (6, 0, 6, 3), row.name: (0, 5, 0, 2)}  # of six tests: seed 0 after 4 and 9 episodes, then seed 1
     found = []
@@ -336,17 +323,20 @@ def test_the_row_that_solves_most_after_its_last_budget_comes_first(row: Path) -
             dataclasses.replace(f, successes=n, mean_return=n + 0.5)
             for f, n in zip(figures, told[each.row.name], strict=True)
         ]
-        paid = tuple(dataclasses.replace(p, env_steps=steps) for p, steps in zip(prices, (4, 20, 4, 40), strict=True))
+        paid = tuple(
+            dataclasses.replace(price, env_steps=steps, train_cpu_s=2.0 * steps)
+            for price, steps in zip(prices, (4, 20, 4, 40), strict=True)
+        )
         claimed = dataclasses.replace(each.row.claimed, prices=paid)
         found.append(dataclasses.replace(each, row=dataclasses.replace(each.row, vouched=tuple(seen), claimed=claimed)))
     section, *_ = board_page(found).sections
     cells = dict(zip(section.tables[0].header, zip(*section.tables[0].rows, strict=True), strict=True))
     assert [re.sub("<.*?>", "", each) for each in cells["return"][:2]] == ["4.00", "2.00"]
-    assert cells["macro-actions (claimed)"][:2] == ("30", "30")
+    assert cells["macro-actions (claimed)"][:2] == ("30", "30") and cells["CPU s (claimed)"][0] == "60.0"
     draw = section.images[0].draw
     assert draw is not None
-    curves = [np.asarray(line.get_ydata()).tolist() for line in draw().axes[0].lines]
-    assert curves == [[100.0, 25.0], [0.0, pytest.approx(100.0 * 7 / 12)]]
+    curves = {line.get_label(): np.asarray(line.get_ydata()).tolist() for line in draw().axes[0].lines}
+    assert curves == {"table": [100.0, 25.0], row.name: [0.0, pytest.approx(100.0 * 7 / 12)]}
 
 
 def test_a_row_of_another_folder_is_not_read_as_one(tmp_path: Path) -> None:
