@@ -81,11 +81,6 @@ def test_grasps_that_slip_are_the_cause_of_every_failure(tmp_path: Path) -> None
             assert sum(lived.faults) == count
 
 
-def test_what_came_later_was_not_known_before(tmp_path: Path) -> None:
-    _, found = asked(tmp_path, "bad", CUBES, budgets=(2, 150))
-    assert "unexperienced" in found.causes.values()
-
-
 @pytest.mark.parametrize("hides", ["", ",gesture=first", ",gesture=0.5", ",lag=1"])
 def test_a_course_is_what_was_seen_before_each_action(hides: str) -> None:
     """A frame is misread where the agent reads something else than it shows; a hidden part cannot be misread."""

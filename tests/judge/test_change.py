@@ -24,6 +24,7 @@ from imagine_bench.judge.change import (
     joint_outcomes,
     streams_of,
 )
+from imagine_bench.judge.questions import FRAMES
 
 ARROWS, BOTH = "arrows:cubes=2", pytest.mark.parametrize("task", ["arrows:cubes=2", "pick_place"])
 
@@ -42,6 +43,22 @@ def test_streams_walk_as_the_rules_say(task: str) -> None:
         total = totals[state, action]
         assert abs(count / total - p) <= 5.0 * math.sqrt(p * (1.0 - p) / total) + 1e-12
     assert {there.one_step.states[row] for row in streams.rows[:, 0]} == set(there.spec.rules.start_states)
+    each = np.bincount(streams.rows.ravel() % (there.spec.n_actions * FRAMES))
+    assert len(each) == there.spec.n_actions * FRAMES, "every macro-action, in either frame"
+    assert each / streams.rows.size == pytest.approx(1.0 / len(each), rel=0.03)
+
+
+def test_a_part_of_the_world_has_no_streams() -> None:
+    """Also where all starts are in that part."""
+    there = judged_world("pick_place")
+    asked = there.one_step
+    elsewhere = next(state for state in asked.states if state not in there.spec.rules.start_states)
+    rows = [row for row, state in enumerate(asked.states) if state != elsewhere]
+    states, truth = (tuple(each[row] for row in rows) for each in (asked.states, asked.truth))
+    part = dataclasses.replace(
+        asked, states=states, truth=truth, frames=asked.frames[rows], actions=asked.actions[rows]
+    )
+    assert streams_of(there.spec, part) is None
 
 
 @BOTH

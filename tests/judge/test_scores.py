@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
 import pytest
-from judged import STILL, Altered, JudgedWorld, asked_pairs, judged_world
+from judged import STILL, Altered, JudgedWorld, asked_pairs, judged_world, shown
 
 from imagine_bench.arrays import Ints
 from imagine_bench.interfaces import Frame, Rules, State
@@ -113,7 +114,42 @@ def test_copy_loses_what_always_doing_the_same_loses() -> None:
     assert found["value_loss_ruled"] == pytest.approx(np.mean(losses(world, lambda _: [0])))
     ranked = ranking_scores(world.spec, world.ranked, world.predictions(STILL, world.ranked))
     assert math.isnan(found["value_loss"]) and math.isnan(found["worst_value_loss"])
-    assert math.isnan(ranked["regret"]) and ranked["regret_ruled"] > 0.0
+    assert math.isnan(ranked["regret"]), "so the first sequence of each start is taken"
+    earned = []
+    for state, actions in zip(world.ranked.states, world.ranked.asked.tolist(), strict=True):
+        earned.append(earning(world.spec.rules, state, actions))
+    of_starts = np.reshape(earned, (-1, questions.RANKED))
+    assert ranked["regret_ruled"] == pytest.approx(np.mean(of_starts.max(axis=1) - of_starts[:, 0]))
+
+
+def earning(rules: Rules, state: State, actions: list[int]) -> float:
+    """The return of macro-actions that leave nothing to chance."""
+    total = 0.0
+    for action in actions:
+        (outcome,) = rules.outcomes(state, action)
+        total += outcome.reward
+        if outcome.terminated:
+            break
+        state = outcome.macrostate
+    return total
+
+
+@pytest.mark.parametrize("task", [ARROWS, "arrows:cubes=2,slip=0.2", "pick_place"])
+def test_rollouts_follow_a_real_history_and_end_as_seldom_as_may_be(task: str) -> None:
+    world = judged_world(task)
+    rules, asked = world.spec.rules, world.rollouts
+    first, expected, spread = 0, 0.0, 0.0
+    for frames, actions, state, steps in zip(asked.frames, asked.actions, asked.states, asked.truth, strict=True):
+        history = [tuple(shown(frame, world.spec).tolist()) for frame in frames]
+        assert len(history) == questions.HISTORY + 1 and history[-1] == state
+        for (before, after), action in zip(itertools.pairwise(history), actions.tolist(), strict=False):
+            outcomes = rules.outcomes(before, action)
+            assert after in [each.macrostate for each in outcomes]
+            first += after == outcomes[0].macrostate
+            expected += outcomes[0].probability
+            spread += outcomes[0].probability * (1.0 - outcomes[0].probability)
+        assert task != ARROWS or not any(over for outcomes in steps for _, over in outcomes), "it can always go on"
+    assert abs(first - expected) <= 4.0 * math.sqrt(spread), "chance decides as the rules say"
 
 
 def test_after_the_end_is_what_no_training_contains() -> None:
@@ -132,6 +168,13 @@ def test_after_the_end_is_what_no_training_contains() -> None:
     assert (exact["after_the_end"], still["after_the_end"]) == (0.0, 1.0)
     assert exact["auroc_after_the_end"] == 0.5 and math.isnan(still["auroc_after_the_end"])
     assert all(map(math.isnan, after_the_end_scores(None, None, world.predictions(STILL, world.one_step)).values()))
+
+    def unsure(found: Imagined, frames: Frame, actions: Ints) -> Imagined:
+        over = [[float(rules.is_terminal(state))] for state, _ in asked_pairs(world, frames, actions)]
+        return dataclasses.replace(found, epistemic=np.array(over))
+
+    there, before = (world.predictions(Altered(world, unsure), each) for each in (asked, world.one_step))
+    assert after_the_end_scores(asked, there, before)["auroc_after_the_end"] == 1.0
 
 
 def test_skill_is_what_is_discarded_rightly_less_what_wrongly() -> None:
@@ -290,6 +333,13 @@ def test_the_value_of_a_filter_is_the_cost_of_mistakes() -> None:
     scores = world.scores(mistaken(world, ends))
     assert scores["value_of_filter"] == pytest.approx(scores["value_loss"]) and scores["value_loss"] > 1.0
     assert scores["value_of_abstaining"] == pytest.approx(scores["value_of_filter"])
+
+    def half(right: Imagined, frames: Frame, actions: Ints) -> Imagined:
+        """Its filter keeps the first frame of each macrostate."""
+        found = mistaken(world, ends).alter(right, frames, actions)
+        return dataclasses.replace(found, accepted=found.accepted | (np.arange(len(frames)) % FRAMES == 0)[:, None])
+
+    assert world.scores(Altered(world, half))["value_of_filter"] == 0.0, "half of its frames keep a transition"
 
 
 def test_probabilities_too_large_and_too_small_do_not_cancel() -> None:

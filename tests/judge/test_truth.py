@@ -29,6 +29,7 @@ THREE = {(1,): 0.5, (2,): 0.3, (3,): 0.2}
         (HALVES, HALVES, 0.0, 0, 0),
         (HALVES, {(1,): 0.5, (3,): 0.25, (4,): 0.25}, 0.5, 1, 2),
         (HALVES, {(9,): 1.0}, 1.0, 2, 1),
+        (HALVES, {(-1,): 1.0}, 1.0, 2, 0),  # an image of nothing is no macrostate
         (HALVES, {(1,): 0.89, (2,): 0.11}, 0.39, 0, 0),  # 0.11 is just above a fifth of 0.5
         (HALVES, {(1,): 0.91, (2,): 0.09}, 0.41, 1, 0),
         (HALVES, {(1,): 0.48, (2,): 0.48, (3,): 0.04}, 0.04, 0, 0),  # below the least of a mode

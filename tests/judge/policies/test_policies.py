@@ -128,19 +128,40 @@ def test_copy_overrates_just_what_enumeration_says() -> None:
     assert all(math.isnan(found[name]) for name in SCORES), "it predicts no rewards"
 
 
+def hopeful(found: Imagined, *_: object) -> Imagined:
+    return dataclasses.replace(found, rewards=np.asarray(found.rewards) + 1.0)
+
+
 def test_a_film_shows_the_outcomes_that_a_model_imagines() -> None:
     """Of one that imagines the right macrostates, and expects a reward that is too large by 1."""
     judged = judged_world(ARROWS)
-
-    def hopeful(found: Imagined, *_: object) -> Imagined:
-        return dataclasses.replace(found, rewards=np.asarray(found.rewards) + 1.0)
-
     found, film = scores_of(ARROWS, Altered(judged, hopeful))
     assert film is not None and len(film.real) == world_of(ARROWS).horizon
     expected = [(action, outcome._replace(reward=outcome.reward + 1.0)) for action, outcome in film.real]
     assert list(film.believed) == expected
     assert len({step.outcome.reached for step in film.real} | {film.start}) > 1
     assert film.returns[0] - film.returns[1] == pytest.approx(found["exploit"]) == len(film.real)
+
+
+def test_a_film_begins_at_a_start_and_shows_the_likeliest_outcomes() -> None:
+    """Of two frames that a model reads differently it shows the likeliest of both."""
+    judged = judged_world(SLIPS)
+
+    def half_blind(found: Imagined, *_: object) -> Imagined:
+        weights = np.array(found.probabilities)
+        weights[1::2] = weights[1::2] == weights[1::2].min(axis=1, keepdims=True)  # in each second frame all slip
+        return hopeful(dataclasses.replace(found, probabilities=weights))
+
+    _, film = scores_of(SLIPS, Altered(judged, half_blind))
+    assert film is not None and {step.outcome.reached for step in film.believed} == {film.start}
+    state = film.start
+    for action, outcome in film.real:
+        likely = next(o for o in judged.spec.rules.outcomes(state, action) if o.probability == 0.8)
+        assert outcome == (likely.macrostate, likely.reward, likely.terminated)
+        state = outcome.reached
+    there = judged_world("pick_place")
+    _, film = scores_of(there.spec.id, Altered(there, hopeful))
+    assert film is not None and film.start in there.spec.rules.start_states
 
 
 def test_no_level_lacks_a_score_and_no_score_a_column() -> None:

@@ -15,6 +15,7 @@ import pytest
 from small_runs import Inline, do, small
 
 from imagine_bench import registry, statistics
+from imagine_bench.data.folder import macrostates_of
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import State
 from imagine_bench.judge import judgement, questions
@@ -217,6 +218,10 @@ def test_models_learn_from_what_the_policy_collected(tmp_path: Path) -> None:
     assert [data.card[name] for name in ("policy", "appearance", "execution", "seed")] == [
         *("mixed", "mild", "kinematic"), 3,
     ]  # fmt: skip
+    states, lengths = iter(map(tuple, macrostates_of(data).tolist())), data.episodes.lengths.tolist()
+    seen = [list(itertools.islice(states, length + 1))[:-1] for length in lengths]
+    tried = list(zip(itertools.chain(*seen), data.episodes.actions.tolist(), strict=True))
+    assert [judgement.visited(data, count) for count in (1, 5, 12)] == [set(tried[:count]) for count in (1, 5, 12)]
 
 
 def test_judgements_that_cannot_be_compared_lie_apart() -> None:

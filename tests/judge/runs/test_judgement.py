@@ -79,6 +79,8 @@ class Spy(Nearest):
         log = Path(os.readlink("/proc/self/fd/1"))  # in the judgement's folder; beside it lies another one
         if [name for name in os.listdir("/proc") if name.isdigit()] == ["1"]:  # it is closed off
             found |= {path.name for path in log.parent.parent.glob("*/*")}
+        if actions[:8, -1].tolist() == [0, 0, 1, 1, 2, 2, 3, 3]:
+            found.add("questions in their order")
         if found:
             raise RuntimeError(f"it found {sorted(found)}")
         frames[...] = 0

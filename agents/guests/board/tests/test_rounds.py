@@ -9,7 +9,7 @@ from pathlib import Path
 
 import bench_fakes  # noqa: F401 - registers its agents
 import pytest
-from board_forging import AFTER, BEFORE, CLOSES, ROUND, TESTS, on, submitted, with_round
+from board_forging import AFTER, BEFORE, CLOSES, ROUND, TESTS, OpenRow, on, submitted, with_round
 from imagine_bench_board import rounds
 from imagine_bench_board.check import check
 from imagine_bench_board.rows import NAME, read_row, row_name
@@ -47,6 +47,17 @@ def test_a_round_from_promise_to_rows(finished: Path, tmp_path: Path) -> None:
     own = read_row(next((board / "rows").iterdir()))
     fingerprints = own.kept(0).fingerprints.tolist()
     assert not set(fingerprints) & set(read_row(other).kept(1).fingerprints.tolist())
+    both = OpenRow(board / "rows" / own.name)
+    both.keep_places([0, 0, 1, 1])
+    both.protocol["budgets"] = [4, 9]
+    both.card["vouched"] = [
+        {**each, "episodes": budget} for each, budget in zip(both.card["vouched"], (4, 9, 4, 9), strict=True)
+    ]
+    for price in both.card["claimed"]["prices"]:
+        price["env_steps"] = 0
+    both.write()
+    (found,) = check(board)
+    assert "a row of a round has the tests of one budget, the last." in found.verdict.complaint
 
 
 @pytest.mark.parametrize("player", ["imagination:" + "deep" * 20, "_best", "__"])

@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import bench_fakes  # noqa: F401 - registers its agents
+import numpy as np
 import pytest
 from board_forging import OpenRow, submitted
 from imagine_bench_board import submit as submitting
 from imagine_bench_board.check import NEVER_SHOWN, NOT_VOUCHED, check
 from imagine_bench_board.page import board_page, write_board
-from imagine_bench_board.rows import CARD, EPISODES, LARGEST, LONGEST, read_row, world_words
+from imagine_bench_board.rows import CARD, EPISODES, LARGEST, LONGEST, Row, read_row, world_words
 from report_pages import in_words
 from small_runs import QUICK, Inline, made_bench, small, written
 from whole_outputs import expected_of
@@ -310,17 +311,32 @@ def test_every_number_of_the_page_leads_to_its_episodes(row: Path, tmp_path: Pat
     assert (page.parent / "board.csv").read_text().count("\n") == 1 + 4
 
 
-def test_rows_of_one_player_have_a_curve_each_and_their_mean_cost(row: Path) -> None:
+def test_the_row_that_solves_most_after_its_last_budget_comes_first(row: Path) -> None:
+    """Figures are means over seeds, in the table and in the curve; rows of one player have a curve each."""
     shutil.copytree(row, row.with_name("a_copy"))
-    opened = OpenRow(row)
-    for price, cpu_s in zip(opened.card["claimed"]["prices"], (10.0, 20.0, 30.0, 60.0), strict=True):
-        price["train_cpu_s"] = cpu_s
-    opened.write()
-    section, *_ = board_page(check(row.parents[1])).sections
-    draw = section.images[0].draw
-    assert draw is not None and [line.get_label() for line in draw().axes[0].lines] == ["table", row.name]
+    told = {"a_copy": (6, 0, 6, 3), row.name: (0, 5, 0, 2)}  # of six tests: seed 0 after 4 and 9 episodes, then seed 1
+    found = []
+    for each in check(row.parents[1]):
+        assert isinstance(each.row, Row)
+        figures, prices = each.row.vouched, each.row.claimed.prices
+        seen = [
+            dataclasses.replace(f, successes=n, mean_return=n + 0.5)
+            for f, n in zip(figures, told[each.row.name], strict=True)
+        ]
+        paid = tuple(
+            dataclasses.replace(price, env_steps=steps, train_cpu_s=2.0 * steps)
+            for price, steps in zip(prices, (4, 20, 4, 40), strict=True)
+        )
+        claimed = dataclasses.replace(each.row.claimed, prices=paid)
+        found.append(dataclasses.replace(each, row=dataclasses.replace(each.row, vouched=tuple(seen), claimed=claimed)))
+    section, *_ = board_page(found).sections
     cells = dict(zip(section.tables[0].header, zip(*section.tables[0].rows, strict=True), strict=True))
-    assert cells["CPU s (claimed)"][1] == "40.0", "of two seeds after 9 episodes"
+    assert [re.sub("<.*?>", "", each) for each in cells["return"][:2]] == ["4.00", "2.00"]
+    assert cells["macro-actions (claimed)"][:2] == ("30", "30") and cells["CPU s (claimed)"][0] == "60.0"
+    draw = section.images[0].draw
+    assert draw is not None
+    curves = {line.get_label(): np.asarray(line.get_ydata()).tolist() for line in draw().axes[0].lines}
+    assert curves == {"table": [100.0, 25.0], row.name: [0.0, pytest.approx(100.0 * 7 / 12)]}
 
 
 def test_a_row_of_another_folder_is_not_read_as_one(tmp_path: Path) -> None:

@@ -7,15 +7,15 @@ import json
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from imagine_bench_programs import __main__ as commands
 from imagine_bench_programs.__main__ import written
 from imagine_bench_programs.agent import LawsAgent, ProgramAgent
-from imagine_bench_programs.model import SymbolModel
+from imagine_bench_programs.model import SymbolModel, WrittenModel
 from imagine_bench_programs.program import Program
-from imagine_bench_programs.seeing import Hidden, hidden_value, still_value
 from imagine_bench_programs.symbols import Symbols
 from imagine_bench_programs.writing.delay import CodedRow
 from imagine_bench_programs.writing.laws import Laws, _completed, _cover, ends_of, simplest
@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from imagine_bench import registry
 from imagine_bench.exact.certificate import certificate
 from imagine_bench.interfaces import AgentContext, Frame, Observation, State, Transition
+from imagine_bench.interfaces.episodes import joined
 from imagine_bench.seeding import SeedTree
 from imagine_bench.sweep.grid import GRIDS, SUITE
 
@@ -151,6 +152,29 @@ def test_a_factor_that_changes_whatever_is_done_drifts() -> None:
     assert laws.drifts == {0: pytest.approx(0.2)} and not any(laws.effects)
     assert laws.superfluous == {0}
     assert sum(each.probability for each in laws.outcomes((0,), 1)) == pytest.approx(1.0)
+
+
+def test_a_drift_stops_with_the_episode_and_is_no_failure_of_a_macro_action() -> None:
+    """One macro-action turns a dial, and the end is where it turns to 0; a light flips by chance until then."""
+    rng = np.random.default_rng(0)
+    rows = []
+    for number in range(800):
+        dial, light, action = number % 4, int(rng.integers(3)), int(rng.integers(2))
+        then = (dial + 1 - action) % 4
+        ended = (dial, then) == (3, 0)
+        flips = not ended and rng.random() < 0.3
+        after = (light + flips * int(rng.integers(1, 3))) % 3
+        rows.append(row((dial, light), (then, after), action, float(ended), ended))
+    laws = Laws((4, 3), 2, rows)
+    assert laws.drifts == {1: pytest.approx(0.3)} and laws.happens[0] == 1.0
+    goes_on, ends = (
+        {each.macrostate: (each.probability, each.reward, each.terminated) for each in laws.outcomes((dial, 1), 0)}
+        for dial in (0, 3)
+    )
+    assert {state: each[0] for state, each in goes_on.items()} == pytest.approx(
+        {(1, 0): 0.15, (1, 1): 0.7, (1, 2): 0.15}
+    )
+    assert ends == {(0, 1): (1.0, 1.0, True)}
 
 
 USES: dict[str, Callable[[State, State], bool] | None] = {
@@ -293,88 +317,6 @@ def test_the_writer_is_exact_from_codes_too() -> None:
     assert found["total_variation"] < 0.005 and found["ranking"] == found["fidelity"] == 1.0
 
 
-def shown(values: Sequence[int | None], hidden: int, episodes: int = 20) -> list[CodedRow]:
-    """A dial of three values, which the image hides where ``values`` says so, and a button that pays where it is 1."""
-    rng = np.random.default_rng(5)
-    rows = []
-    for _ in range(episodes):
-        dial = int(rng.integers(3))
-        for step, (before, after) in enumerate(itertools.pairwise(values)):
-            now, then = (hidden if each is None else dial for each in (before, after))
-            rows.append(CodedRow((now, 0), 0, (then, 0), float(dial == 1), False, step))
-    return rows
-
-
-def test_a_value_that_hides_a_factor_is_found_by_its_contradictions() -> None:
-    hidden = hidden_value(shown((1, None, 1, None), hidden=3), (4, 1))
-    assert hidden is not None and hidden[:2] == (0, 3)
-    filled = hidden.filled(shown((1, None, None), hidden=3))
-    assert all(each.now == each.then and min(each.now) >= 0 for each in filled)
-    assert hidden_value(shown((1, 1, 1), hidden=3), (4, 1)) is None, "nothing is hidden, and nothing contradicts"
-    (first, *_) = Hidden(0, 3).filled(shown((None, 1, 1), hidden=3))
-    assert first.now == (-1, 0), "nothing was seen before"
-
-
-def dials(then: Sequence[int], later: Sequence[int]) -> list[CodedRow]:
-    """Three episodes of two steps along a counter, none of which meets the counter's values of another one.
-
-    Each episode has a dial, whose value after both steps is in ``then`` and ``later``; a counter of 8 pays where it is
-    the dial's first value, and ends.
-    """
-    rows = []
-    for dial, (middle, last) in enumerate(zip(then, later, strict=True)):
-        count = 3 * dial
-        rows.append(CodedRow((dial, count), 0, (middle, count + 1), 0.0, False, 0))
-        rows.append(CodedRow((middle, count + 1), 0, (last, (count + 2) % 8), float(dial == 2), False, 1))
-    return rows
-
-
-def test_a_value_that_hides_a_factor_is_found_without_contradictions() -> None:
-    rows = dials((3, 3, 3), (3, 3, 3))
-    assert hidden_value(rows, (4, 8)) is None, "no code comes twice"
-    assert still_value(rows, (4, 8), 1) == (0, 3, -1)
-    assert still_value(dials((0, 1, 2), (0, 1, 2)), (4, 8), 1) is None, "nothing changes"
-    assert still_value(dials((1, 2, 0), (2, 0, 1)), (4, 8), 1) is None, "a dial that turns is not hidden"
-
-
-def test_transitions_that_are_left_out_make_an_explanation_no_shorter() -> None:
-    """A macro-action turns a dial from 3 to 0; without 3 the dial never changes, and 40 noisy transitions are gone."""
-    rng = np.random.default_rng(0)
-    noise = rng.integers(8, size=(100, 2)).tolist()
-    rows = [
-        row((3 * turns, before), (0, after), action=int(not turns))
-        for turns, (before, after) in zip([True] * 40 + [False] * 60, noise, strict=True)
-    ]
-    filled = Hidden(0, 3).filled(rows)
-    assert sum(min(*each.now, *each.then) >= 0 for each in filled) == 60
-    assert still_value(rows, (4, 8), 2) is None
-
-
-def test_a_light_that_flips_by_chance_is_not_hidden() -> None:
-    rng = np.random.default_rng(0)
-    lights = np.cumsum(rng.random(201) < 0.2) % 2
-    rows = [
-        CodedRow((int(now), step % 3), 0, (int(then), (step + 1) % 3), 0.0, False, step)
-        for step, (now, then) in enumerate(itertools.pairwise(lights))
-    ]
-    assert not any(each.now[0] != each.then[0] for each in Hidden(0, 1).filled(rows)), "it would never change"
-    assert still_value(rows, (2, 3), 1) is None, "to say which images hide it takes longer"
-
-
-def test_a_factor_of_one_value_that_images_hide_says_nothing() -> None:
-    rng = np.random.default_rng(0)
-    hides = (rng.random(121) < 0.1).astype(int).tolist()
-    rows = [
-        CodedRow((before, step % 3), 0, (after, (step + 1) % 3), float(step == 1), False, step % 3)
-        for step, (before, after) in enumerate(itertools.pairwise(hides))
-    ]
-    hidden = hidden_value(rows, (2, 3)) or still_value(rows, (2, 3), 1)
-    assert hidden is not None and hidden.only == 1 - hidden.value
-    starts = [each for each in hidden.filled(rows) if not each.step]
-    assert {each.now[0] for each in starts} == {hidden.only}, "also in an image that is the first of an episode"
-    assert any(each.now[0] == hidden.value for each in rows if not each.step), "some of them hide it"
-
-
 class ByteSymbols(Symbols):
     """The code of a frame is its first two bytes; a probe adds 10."""
 
@@ -430,6 +372,29 @@ def test_what_a_program_remembers_goes_with_the_state_until_the_episode_ends(tmp
         assert found.rewards is not None and found.rewards[0, 0, -1] == found.p_ended[0, 0, -1] == 1.0
 
 
+def test_the_laws_of_a_dataset_are_those_of_its_transitions() -> None:
+    """Of several episodes, whose symbols are late; each begins anew."""
+    rows = late(1)
+    episodes: list[dict[str, Any]] = []
+    for each in rows:
+        if each.step == 0:
+            episodes.append({"frames": [each.now], **{name: [] for name in ("actions", "rewards", "terminated")}})
+        seen = {"frames": each.then, "actions": each.action, "rewards": each.reward, "terminated": each.ended}
+        for name, value in seen.items():
+            episodes[-1][name].append(value)
+    for each in episodes:
+        ends = each["terminated"]
+        frames = np.array(each["frames"], dtype=np.uint8)[:, None, None].repeat(64, 1).repeat(64, 2).repeat(3, 3)
+        masks = np.ones((len(frames), 2), dtype=np.int8)
+        cut = [*[False] * (len(ends) - 1), not ends[-1]]
+        each |= {"frames": frames, "action_masks": masks, "truncated": cut, "success": ends[-1]}
+    model = WrittenModel(ByteSymbols((5,)), Laws((5,), 2))
+    model.fit(joined(episodes), np.random.default_rng(0))
+    laws, found = Laws((5,), 2, rows), model.rules
+    assert isinstance(found, Laws) and (found.nats, found.delay, found.ends) == (laws.nats, 1, laws.ends)
+    assert model.parameters() == laws.count
+
+
 def test_plans_begin_after_the_macro_actions_of_this_episode() -> None:
     """Frames are a macro-action late. The second macro-action ends the episode from 2, the first one from 4."""
     context = AgentContext(n_actions=2, preprocessing="none", encoder=None, seeds=SeedTree(0))
@@ -448,14 +413,16 @@ def test_plans_begin_after_the_macro_actions_of_this_episode() -> None:
             truncated=each.step == 7 and not each.ended,
         )
         agent.observe(transition, episode=number)
-    assert agent.writer.rows == late(1, episodes=40) and agent.writer.laws.delay == 1
-    for _ in range(2):
-        agent.begin_episode()
-        assert [agent.act(Observation(frame=frames[3]), explore=False) for _ in range(2)] == [0, 0]
-        agent.begin_episode()
-        assert agent.act(Observation(frame=frames[2]), explore=False) == 1, "nothing is on its way yet"
-        agent.begin_episode()
-        both = {agent.act(Observation(frame=frames[1]), explore=False) for _ in range(2)}
+    resumed = LawsAgent(ByteSymbols((5,)), context)
+    resumed.restore(agent.state())
+    for who in (agent, resumed):
+        assert who.writer.rows == late(1, episodes=40) and who.writer.laws.delay == 1
+        who.begin_episode()
+        assert [who.act(Observation(frame=frames[3]), explore=False) for _ in range(2)] == [0, 0]
+        who.begin_episode()
+        assert who.act(Observation(frame=frames[2]), explore=False) == 1, "nothing is on its way yet"
+        who.begin_episode()
+        both = {who.act(Observation(frame=frames[1]), explore=False) for _ in range(2)}
         assert both == {0, 1}, "the second begins where the first leads, which no frame shows yet"
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections import Counter
 from collections.abc import Sequence
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -14,7 +16,7 @@ from imagine_bench_factored.seeing.appearance import SeenFactor
 from imagine_bench_factored.seeing.standard import Standard
 from imagine_bench_programs.__main__ import _explore, written
 from imagine_bench_programs.scores import Codes, ReadRules, score
-from imagine_bench_programs.seeing import SeeingWriter, SeenCodes
+from imagine_bench_programs.seeing import Hidden, SeeingWriter, SeenCodes, hidden_value, still_value
 from imagine_bench_programs.symbol_rules import SymbolRules
 from imagine_bench_programs.writing.delay import CodedRow
 from imagine_bench_programs.writing.writer import Writer
@@ -198,12 +200,107 @@ def test_rules_between_codes_are_scored_as_a_probe_reads_them() -> None:
     assert (found.total_variation, found.ranking) == (0.0, 1.0) and found.found == found.facts > 0
 
 
+class Attentive(Writer):
+    """Notes before which of its transitions it is told that an episode begins, and that the first one does."""
+
+    def __init__(self, *given: Any) -> None:
+        super().__init__(*given)
+        self.begun = [0]
+
+    def begin_episode(self) -> None:
+        super().begin_episode()
+        self.begun.append(len(self.rows))
+
+
 @pytest.mark.parametrize("seed", [1003, 1005])
 def test_a_program_of_codes_has_every_fact(seed: int) -> None:
     spec = registry.task("arrow_puzzle")
     starts, choices, names = (np.random.default_rng([seed, each]) for each in range(3))
     codes = ShuffledCodes(spec, names)
-    writer = Writer(codes.sizes, spec.n_actions, choices)
+    writer = Attentive(codes.sizes, spec.n_actions, choices)
     _explore(writer, spec, 224, starts, codes.of)
+    assert [each for each in writer.begun if each < 224] == [n for n, row in enumerate(writer.rows) if row.step == 0]
     found = score(ReadRules(writer.laws, codes), spec)
     assert (found.total_variation, found.found) == (0.0, found.facts)
+
+
+def shown(values: Sequence[int | None], hidden: int, episodes: int = 20) -> list[CodedRow]:
+    """A dial of three values, which the image hides where ``values`` says so, and a button that pays where it is 1."""
+    rng = np.random.default_rng(5)
+    rows = []
+    for _ in range(episodes):
+        dial = int(rng.integers(3))
+        for step, (before, after) in enumerate(itertools.pairwise(values)):
+            now, then = (hidden if each is None else dial for each in (before, after))
+            rows.append(CodedRow((now, 0), 0, (then, 0), float(dial == 1), False, step))
+    return rows
+
+
+def test_a_value_that_hides_a_factor_is_found_by_its_contradictions() -> None:
+    hidden = hidden_value(shown((1, None, 1, None), hidden=3), (4, 1))
+    assert hidden is not None and hidden[:2] == (0, 3)
+    filled = hidden.filled(shown((1, None, None), hidden=3))
+    assert all(each.now == each.then and min(each.now) >= 0 for each in filled)
+    assert hidden_value(shown((1, 1, 1), hidden=3), (4, 1)) is None, "nothing is hidden, and nothing contradicts"
+    (first, *_) = Hidden(0, 3).filled(shown((None, 1, 1), hidden=3))
+    assert first.now == (-1, 0), "nothing was seen before"
+
+
+def dials(then: Sequence[int], later: Sequence[int]) -> list[CodedRow]:
+    """Three episodes of two steps along a counter, none of which meets the counter's values of another one.
+
+    Each episode has a dial, whose value after both steps is in ``then`` and ``later``; a counter of 8 pays where it is
+    the dial's first value, and ends.
+    """
+    rows = []
+    for dial, (middle, last) in enumerate(zip(then, later, strict=True)):
+        count = 3 * dial
+        rows.append(CodedRow((dial, count), 0, (middle, count + 1), 0.0, False, 0))
+        rows.append(CodedRow((middle, count + 1), 0, (last, (count + 2) % 8), float(dial == 2), False, 1))
+    return rows
+
+
+def test_a_value_that_hides_a_factor_is_found_without_contradictions() -> None:
+    rows = dials((3, 3, 3), (3, 3, 3))
+    assert hidden_value(rows, (4, 8)) is None, "no code comes twice"
+    assert still_value(rows, (4, 8), 1) == (0, 3, -1)
+    assert still_value(dials((0, 1, 2), (0, 1, 2)), (4, 8), 1) is None, "nothing changes"
+    assert still_value(dials((1, 2, 0), (2, 0, 1)), (4, 8), 1) is None, "a dial that turns is not hidden"
+
+
+def test_transitions_that_are_left_out_make_an_explanation_no_shorter() -> None:
+    """A macro-action turns a dial from 3 to 0; without 3 the dial never changes, and 40 noisy transitions are gone."""
+    rng = np.random.default_rng(0)
+    noise = rng.integers(8, size=(100, 2)).tolist()
+    rows = [
+        CodedRow((3 * turns, before), int(not turns), (0, after), 0.0, False)
+        for turns, (before, after) in zip([True] * 40 + [False] * 60, noise, strict=True)
+    ]
+    filled = Hidden(0, 3).filled(rows)
+    assert sum(min(*each.now, *each.then) >= 0 for each in filled) == 60
+    assert still_value(rows, (4, 8), 2) is None
+
+
+def test_a_light_that_flips_by_chance_is_not_hidden() -> None:
+    rng = np.random.default_rng(0)
+    lights = np.cumsum(rng.random(201) < 0.2) % 2
+    rows = [
+        CodedRow((int(now), step % 3), 0, (int(then), (step + 1) % 3), 0.0, False, step)
+        for step, (now, then) in enumerate(itertools.pairwise(lights))
+    ]
+    assert not any(each.now[0] != each.then[0] for each in Hidden(0, 1).filled(rows)), "it would never change"
+    assert still_value(rows, (2, 3), 1) is None, "to say which images hide it takes longer"
+
+
+def test_a_factor_of_one_value_that_images_hide_says_nothing() -> None:
+    rng = np.random.default_rng(0)
+    hides = (rng.random(121) < 0.1).astype(int).tolist()
+    rows = [
+        CodedRow((before, step % 3), 0, (after, (step + 1) % 3), float(step == 1), False, step % 3)
+        for step, (before, after) in enumerate(itertools.pairwise(hides))
+    ]
+    hidden = hidden_value(rows, (2, 3)) or still_value(rows, (2, 3), 1)
+    assert hidden is not None and hidden.only == 1 - hidden.value
+    starts = [each for each in hidden.filled(rows) if not each.step]
+    assert {each.now[0] for each in starts} == {hidden.only}, "also in an image that is the first of an episode"
+    assert any(each.now[0] == hidden.value for each in rows if not each.step), "some of them hide it"

@@ -158,10 +158,16 @@ def pairs_of_play(spec: TaskSpec) -> list[tuple[State, int]]:
 
 
 def test_experience_of_another_task_gives_no_efficiency(tmp_path: Path) -> None:
-    for task in ("arrow_puzzle", "arrows:slip=0.5", "pick_place", "arrows:gesture=first"):
+    for task in ("arrow_puzzle", "arrows:slip=0.5", "pick_place", "arrows:gesture=first,horizon=2"):
         folder = tmp_path / task
         write_experience(task, folder, macro_actions=30, seed=0)
         assert macro_actions_of(folder, registry.task(task)) == 30
+        rows, step = json.loads((folder / "experience.json").read_text())["transitions"], 0
+        for row, following in itertools.pairwise(rows):
+            step += 1
+            assert row[5] == (row[4] or step == registry.task(task).horizon), "the last of its episode"
+            assert row[5] or row[2] == following[0]
+            step *= not row[5]
     for task in ("arrows:slip=0.5", "pick_place"):
         with pytest.raises(InvalidValueError, match=r"holds experience that arrow_puzzle cannot give"):
             macro_actions_of(tmp_path / task, registry.task("arrow_puzzle"))
@@ -309,11 +315,15 @@ def test_a_program_is_judged_exact_and_benched_without_training(tmp_path: Path) 
     assert {float(share) for share in found.frame()["success_rate"]} == {1.0}
 
 
-def test_experience_begins_from_every_start() -> None:
-    spec = registry.task("arrows:cubes=2")
+def test_experience_begins_from_every_start_and_chance_decides_as_the_rules_say() -> None:
+    """One of five macro-actions slips, and the gesture is seen in three of ten first frames."""
+    spec = registry.task("arrows:cubes=2,slip=0.2,gesture=0.3")
     rng = np.random.default_rng(0)
-    rows = itertools.islice(play(spec, lambda _: int(rng.integers(spec.n_actions)), rng), 2000)
-    assert {row.now for row, _ in rows if row.step == 0} == set(spec.rules.start_states)
+    rows = [row for row, _ in itertools.islice(play(spec, lambda _: int(rng.integers(4)), rng), 3000)]
+    starts = [row.now for row in rows if row.step == 0]
+    assert {state for state in starts if state[-1] >= 0} == set(spec.rules.start_states)
+    for found, share in (([row.then[:-1] == row.now[:-1] for row in rows], 0.2), ([s[-1] >= 0 for s in starts], 0.3)):
+        assert abs(np.mean(found) - share) < 4.0 * np.sqrt(share * (1.0 - share) / len(found))
 
 
 def test_experience_is_as_late_and_hidden_as_frames() -> None:
