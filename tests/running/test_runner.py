@@ -267,7 +267,7 @@ def test_a_loop_that_ends_early_is_no_finished_run(tmp_path: Path) -> None:
     registry.AGENTS["early"] = dataclasses.replace(made, make=f"{__name__}:Elsewhere")
     again = do(tmp_path / "run", "early", agents=("early",), budgets=(2, 5), evaluation_episodes=1)
     assert [row.episodes for row in again.checkpoints] == [2, 5], "the next attempt begins anew"
-    assert len(again.training_length) == 5
+    assert len(again.training_length) == Elsewhere.given["played"] == 5
 
 
 def test_an_agent_that_does_not_learn_is_tested_once(tmp_path: Path) -> None:
