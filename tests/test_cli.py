@@ -22,6 +22,7 @@ import torch
 from imagine_bench.agents.encoders.perception import prepare_torch
 from small_runs import Inline
 
+import imagine_bench
 from imagine_bench import cli, errors, registry
 from imagine_bench.cli import exit_code as main
 from imagine_bench.cli import tools
@@ -134,7 +135,7 @@ def test_a_failing_seed_fails_the_command_and_names_its_log(
 def test_a_bench_ends_with_a_table_a_report_and_recordings(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], inline: Inline
 ) -> None:
-    few = "--agents random oracle --seeds 0 1 --budgets 10 20 --evaluation-episodes 10"
+    few = "--agents random oracle --seeds 3 5 --budgets 10 20 --evaluation-episodes 10"
     words = bench_words(tmp_path, *few.split(), preset="quick")
     assert main(words) == 0
     said = capsys.readouterr().out
@@ -142,7 +143,7 @@ def test_a_bench_ends_with_a_table_a_report_and_recordings(
     assert re.search(r"^oracle +100", said, re.MULTILINE)
     assert f"Report:     {folder}/report/index.html" in said
     assert (folder / "report" / "index.html").stat().st_size > 10_000
-    assert len(list(folder.glob("*/seed_0/recording.rrd"))) == 2
+    assert len(list(folder.glob("*/seed_3/recording.rrd"))) == 2
     assert "Recordings: 2, such as" in said, "those of the first seed"
     assert main(words) == 0
     assert len(inline.order) == 4, "a finished bench is not run again"
@@ -222,7 +223,10 @@ def test_seeds_are_added_until_it_is_decided_or_there_are_enough(
     (parts,) = re.findall(r"Parts: +(.+)", printed)
     assert all((Path(part) / "report" / "index.html").is_file() for part in parts.split(", "))
     assert [Path(part).parts[-3] == "added" for part in parts.split(", ")] == [False, True]
+    again: dict[str, Any] = {"budgets": 2, "evaluation_episodes": 2, "until_decided": True, "most_seeds": 3}
+    read = imagine_bench.bench("arrow_puzzle", preset="smoke", execution="kinematic", out=tmp_path, **again)
     assert main(words) == 0 and len(inline.order) == 8, "a finished search is only read"
+    assert read.folder / "report/index.html" == Path(report), "from Python as well"
 
 
 @pytest.mark.parametrize("group", [registry.TASK_GROUP, registry.AGENT_GROUP, registry.WORLD_MODEL_GROUP])

@@ -7,6 +7,7 @@ import csv
 import dataclasses
 import functools
 import io
+import shlex
 import shutil
 import subprocess
 import sys
@@ -38,6 +39,7 @@ from imagine_bench.judge.models import model_entry
 from imagine_bench.registry.by_value import CodeByValue, code_digest
 from imagine_bench.running.trained import learners, load_trained
 from imagine_bench.store import encoders
+from imagine_bench.store.files import read_sealed
 
 _LOCK = threading.Lock()
 _TIMES = ("train_cpu_s", "eval_cpu_s")
@@ -292,6 +294,10 @@ def test_a_frame_is_the_table_of_the_report(results: api.Comparison, monkeypatch
                 else:
                     assert type(value)(cell) == value, (name, column)
     assert all(isinstance(value, str) for value in results.frame()["solved"]), "digits that are a text"
+    told = shlex.split(read_sealed(results.folder / "sessions.json", "sessions")["environment"]["command"])
+    given = "preset='smoke', agents=['random', 'Shifting'], seeds=1, budgets=[1, 2], evaluation_episodes=2, "
+    call = f"imagine_bench.bench('arrow_puzzle', {given}execution='kinematic')"
+    assert told == ["python", "-c", f"import imagine_bench; {call}"]
     pandas = ModuleType("pandas")
     vars(pandas)["DataFrame"] = lambda columns: ("pandas", columns)
     monkeypatch.setitem(sys.modules, "pandas", pandas)

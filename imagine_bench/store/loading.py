@@ -95,7 +95,7 @@ def _kept_runs(folder: Path, whole: Protocol) -> Runs:
 def archive_files(result: BenchResult) -> dict[str, str]:
     """The two files in which a bench of agents is kept for good, by name."""
     environment = dict(result.environment)
-    sessions = environment.pop("sessions", [])
+    sessions = environment.pop("sessions", [{"wall_s": result.wall_s}])  # merged benches have their own
     facts = {
         "protocol": (result.whole or result.protocol).as_dict(),
         "protocol_hash": result.protocol_hash,
@@ -181,8 +181,7 @@ def _largest_table(whole: Protocol, reached: Mapping[tuple[str, int], int]) -> P
 
 def _runs_of(part: Protocol, runs: Runs) -> tuple[RunResult, ...]:
     """The runs of a protocol, as far as it goes."""
-    found = [runs.get(pair) for pair in part.runs]
-    return tuple(cut(run, part) for run in found if run is not None)
+    return tuple(cut(run, part) for pair in part.runs if (run := runs.get(pair)))
 
 
 def cut(result: RunResult, part: Protocol) -> RunResult:

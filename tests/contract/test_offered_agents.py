@@ -125,6 +125,16 @@ def test_an_offer_that_is_no_agent_costs_nobody_anything(
     assert sentence in said and "fine" in said
 
 
+def test_a_name_is_that_of_one_of_two_packages(guests: Guests) -> None:
+    for package in ("their_one", "their_other"):
+        module = _MODULE.replace("their_package", package)
+        guests.write(package, module, {registry.AGENT_GROUP: {"mine": f"{package}:ENTRY"}})
+    keeps = str(registry.agent_entry("mine").make).partition(":")[0]
+    (loses,) = {"their_one", "their_other"} - {keeps}
+    with pytest.raises(SetupError, match=f"The package {loses} offers .* as agent mine, a name that is taken"):
+        registry.agent_entry(f"{loses}:mine")
+
+
 def arrays_in(value: object) -> Iterator[NDArray[np.generic]]:
     """Every array that somebody is handed within dataclasses, mappings and sequences."""
     if isinstance(value, np.ndarray):

@@ -27,6 +27,7 @@ from imagine_bench.store import encoders
 _OFFERS = {
     registry.ENCODER_GROUP: {
         "tiles": "their_things:TILES",
+        "corners": "their_things:CORNERS",
         "blind": "their_things:BLIND",
         "broken": "their_things:Tiles",
     },
@@ -53,11 +54,19 @@ class Tiles:
     def decode(self, latents):
         return (latents.reshape(-1, 4, 4, 3) / 1000.0).repeat(16, axis=1).repeat(16, axis=2)
 
+class Corners:
+    """Whether the left and the right half are brighter above than below, each a factor of two values."""
+    code_sizes = (2, 2)
+    def encode(self, frames):
+        halves = frames.reshape(len(frames), 2, 32, 2, 32, 3).mean(axis=(2, 4, 5))
+        return np.eye(2)[(halves[:, 0] > halves[:, 1]).astype(int)].reshape(len(frames), 4)
+
 class Blind:
     def encode(self, frames):
         return np.full((len(frames), 3), np.nan)
 
 TILES = EncoderEntry(make="their_things:Tiles")
+CORNERS = EncoderEntry(make="their_things:Corners")
 BLIND = EncoderEntry(make="their_things:Blind")
 RANDOM = Variant(name="random", factor="base", agent="random")
 STUDY = Study(name="their_study", question="Whose?", budgets=(2,), variants=(RANDOM,))
@@ -114,6 +123,20 @@ def test_an_own_representation_trains_an_agent(tmp_path: Path, capsys: pytest.Ca
     assert (far.min(), far.max()) == (0.0, 1.0), "images of latents that were never seen are cut off"
     right = (encoder.read_macrostate(mu) == states).all(axis=1).mean()
     assert right > 0.2 > 4 / len(spec.rules.states)
+
+
+def test_codes_of_theirs_stay_as_they_are() -> None:
+    """Only latents are brought to one scale."""
+    path = encoders.resolve(registry.task("arrow_puzzle"), "clean", "corners")
+    card = Encoder.load(path).card
+    assert (encoders.kind(path), card.code_sizes, card.latent_size) == ("codes", (2, 2), 4)
+    assert card.command == "imagine-bench bench --task arrow_puzzle --appearance clean --encoder corners"
+    assert card.data.startswith("those of their_things:Corners, 400 and 100 held-out frames")
+    frames = np.zeros((4, 64, 64, 3), np.uint8)
+    for number, frame in enumerate(frames):
+        frame[:32, :32], frame[:32, 32:] = 9 * (number % 2), 9 * (number // 2)
+    codes = Encoder.load(path).encode(frames)[0].tolist()
+    assert codes == [[1, 0, 1, 0], [0, 1, 1, 0], [1, 0, 0, 1], [0, 1, 0, 1]]
 
 
 def test_one_without_a_decoder_draws_gray() -> None:

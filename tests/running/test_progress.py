@@ -12,14 +12,16 @@ import pytest
 from bench_fakes import FakeRunSpec
 from small_runs import small
 
-from imagine_bench.protocols.data import Phase, Progress
+from imagine_bench.protocols.data import Phase, Progress, RunSpec
 from imagine_bench.registry import AGENTS
-from imagine_bench.running.bench import ProgressBar, counted
+from imagine_bench.running.bench import ProgressBar, counted, plan
 
 WORK = 9 + 2 * 5
 """Of a learner: training episodes, and tests at two budgets."""
-PROTOCOL = small(agents=("table", "random"), seeds=(0, 1, 2))
-SPECS = [FakeRunSpec(protocol=PROTOCOL, agent=agent, seed=seed) for agent in PROTOCOL.agents for seed in PROTOCOL.seeds]
+PROTOCOL = small(agents=("table", "random"), seeds=(0, 1))
+BENCHES = (PROTOCOL, small(agents=("table", "random"), seeds=(0,), appearance="mild"))
+"""As of a study: runs of one agent and seed."""
+SPECS = [FakeRunSpec(protocol=each, agent=agent, seed=seed) for each in BENCHES for agent, seed in each.runs]
 
 
 def far(seed: int, done: int, phase: Phase = "training", **more: Any) -> Progress:
@@ -90,6 +92,21 @@ def test_a_share_that_is_solved_is_of_tests_alone(
         now_s[0] = 20.0
         show(far(0, 4, phase, episode=6, success=0.4))
     assert capsys.readouterr().err.splitlines()[-1].endswith(words)
+
+
+def test_a_run_without_episodes_says_the_share_of_its_work(
+    now_s: list[float], capsys: pytest.CaptureFixture[str]
+) -> None:
+    spec = RunSpec(protocol=plan("toy_regression", "smoke")[0], agent="mc_dropout", seed=0)
+    at = {"agent": "mc_dropout", "seed": 0, "bench": spec.protocol.hash, "work": spec.work}
+    with ProgressBar([spec]) as show:
+        for part, detail in ((0.25, None), (0.5, "network 2")):
+            now_s[0] += 20.0
+            show(Progress(**at, phase="training", done=round(part * spec.work), detail=detail))
+    assert [line.partition(" · mc_dropout seed 0: ")[2] for line in capsys.readouterr().err.splitlines()] == [
+        f"{words}, {100 * round(part * spec.work) / spec.work:.0f} % of its work"
+        for part, words in ((0.25, "training"), (0.5, "network 2"))
+    ]
 
 
 def test_time_left_of_things_is_that_of_those_done(now_s: list[float], capsys: pytest.CaptureFixture[str]) -> None:

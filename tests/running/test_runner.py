@@ -34,8 +34,9 @@ from imagine_bench.registry import AgentEntry
 from imagine_bench.rules import states_of
 from imagine_bench.running.evaluation import start_from
 from imagine_bench.running.run_state import Counters, make_env
+from imagine_bench.running.runner import run
 from imagine_bench.seeding import TUNING_SEEDS, episode_seed
-from imagine_bench.store.run_folder import load_newest
+from imagine_bench.store.run_folder import load_newest, load_run
 
 
 def test_a_repeated_action_keeps_the_episode_of_its_first_time() -> None:
@@ -114,6 +115,31 @@ def test_a_run_counts_what_happens(tmp_path: Path) -> None:
     assert [row.diagnostics["real_transitions"] for row in result.checkpoints] == steps
     assert all(row.test_episodes == 5 and 1 <= row.mean_length <= 10 for row in result.checkpoints)
     assert (result.agent, result.seed, result.settings) == ("table", 3, {"rate": 0.5})
+
+
+class Slow(bench_fakes.TableAgent):
+    """Takes so long over each episode that all news of its run are told."""
+
+    def begin_episode(self) -> None:
+        time.sleep(0.26)
+
+
+@pytest.mark.usefixtures("own_names")
+def test_news_say_what_is_done_and_the_share_solved_in_this_phase(tmp_path: Path) -> None:
+    """Both demonstrations are solved, and few of the tests."""
+    registry.AGENTS["slow"] = dataclasses.replace(registry.AGENTS["table"], make=f"{__name__}:Slow")
+    wanted = small(agents=("slow",), budgets=(2,), demonstrations=2, evaluation_episodes=4)
+    heard: list[Progress] = []
+    run(RunSpec(protocol=wanted, agent="slow", seed=0), tmp_path, heard.append)
+    solved = load_run(tmp_path).checkpoints[0].solved
+    assert solved is not None and "0" in solved
+    shares = [solved[:count].count("1") / count for count in (1, 2, 3, 4)]
+    assert [(each.phase, each.episode, each.done, each.success) for each in heard] == [
+        ("training", 1, 1, 1.0),
+        ("training", 2, 2, 1.0),
+        *(("testing", 2, 2 + count, share) for count, share in enumerate(shares, start=1)),
+        ("done", 2, 6, 1.0),
+    ]
 
 
 @pytest.mark.parametrize("agent", ["table", "random"])
@@ -238,6 +264,10 @@ def test_a_loop_that_ends_early_is_no_finished_run(tmp_path: Path) -> None:
     with pytest.raises(InvalidValueError, match=r"agent 'early' ended after 3 of 5 episodes"):
         do(tmp_path / "run", "early", agents=("early",), budgets=(2, 5), evaluation_episodes=1)
     assert not (tmp_path / "run" / "DONE").exists()
+    registry.AGENTS["early"] = dataclasses.replace(made, make=f"{__name__}:Elsewhere")
+    again = do(tmp_path / "run", "early", agents=("early",), budgets=(2, 5), evaluation_episodes=1)
+    assert [row.episodes for row in again.checkpoints] == [2, 5], "the next attempt begins anew"
+    assert len(again.training_length) == Elsewhere.given["played"] == 5
 
 
 def test_an_agent_that_does_not_learn_is_tested_once(tmp_path: Path) -> None:

@@ -76,7 +76,8 @@ def test_a_session_elsewhere_is_noticed(tmp_path: Path) -> None:
     opened(tmp_path).begin_session(_ENVIRONMENT)
     torch = {"versions": {"torch": "2"}}
     changes = [({**torch, "command": "other"}, ["versions"]), ({"gl_renderer": "y"}, ["gl_renderer"])]
-    for change, changed in [*changes, ({"machine": {"cpu": "another", "cores": 2}}, ["cpu"])]:
+    changes += [({"commit": "def"}, ["commit"]), ({"machine": {"cpu": "another", "cores": 2}}, ["cpu"])]
+    for change, changed in changes:
         assert opened(tmp_path).begin_session({**_ENVIRONMENT, **change}) == changed
     sessions = json.loads((opened(tmp_path).folder / "sessions.json").read_text())["sessions"]
     assert [session["changed"] for session in sessions][:2] == [{}, torch]

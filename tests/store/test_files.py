@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from typing import Any
 import pytest
 
 from imagine_bench.errors import ArtefactError, BusyError, SetupError
+from imagine_bench.store import run_folder
 from imagine_bench.store.files import (
     first_difference,
     lock,
@@ -139,7 +141,9 @@ def test_a_lock_is_held_by_one_process_and_freed_by_its_death(tmp_path: Path) ->
             lock(path, "The folder"),
         ):
             pass
-        child.kill()
+        threading.Timer(0.3, child.kill).start()
+        with run_folder.unfinished(tmp_path) as is_left:  # it waits: the child of a killed command may be dying
+            assert is_left
         child.wait()
     with lock(path, "The folder"):
         assert str(os.getpid()) in (tmp_path / ".lock.holder").read_text()

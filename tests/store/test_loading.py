@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import functools
 import json
@@ -15,8 +16,10 @@ import pytest
 from fake_results import bench_result, rewritten
 from small_runs import made_bench, small
 
+from imagine_bench import statistics
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.exact.certificate import certificate
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.report.bench import bench_page
 from imagine_bench.report.page import write_page
@@ -135,7 +138,21 @@ def test_exact_facts_are_those_of_any_and_time_is_that_of_all(tmp_path: Path, la
     ]
     joined = merge(parts, tmp_path)
     assert joined.wall_s == 5.0 and joined.certificate == exact is not None
+    kept = load_so_far(kept_from(joined.folder, tmp_path / "kept", joined))
+    assert (kept.wall_s, kept.certificate) == (5.0, exact)
+    coded = [
+        dataclasses.replace(each, protocol=dataclasses.replace(each.protocol, code=(("oracle", digits),)))
+        for each, digits in zip(both, ("0" * 12, "1" * 12), strict=True)
+    ]
+    with pytest.raises(InvalidValueError, match="An agent's code was another one in each of the benches"):
+        merge(coded, tmp_path)
     assert all(each.wall_s > 0.0 for each in both), "the time of a session is noted at its end, too"
+
+
+def test_the_exact_facts_of_a_split_are_those_of_its_tests(tmp_path: Path) -> None:
+    result = load_bench(do(tmp_path, "oracle", task="arrows:cubes=2", split="plan_length=1"))
+    of_tests, of_training = (certificate(result.protocol.spec(testing=testing)) for testing in (True, False))
+    assert result.certificate == of_tests != of_training
 
 
 def test_what_one_of_them_lacks_is_said(tmp_path: Path) -> None:
@@ -191,6 +208,9 @@ def test_seeds_whose_machines_chose_other_settings_are_refused(tmp_path: Path) -
 def test_kept_results_say_what_their_run_folders_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first, second = do(tmp_path, "oracle"), do(tmp_path, "random")
     kept = kept_from(second, tmp_path / "kept")
+    said, known = load_so_far(kept), load_bench(second)
+    for name in ("protocol", "environment", "wall_s", "certificate"):
+        assert getattr(said, name) == getattr(known, name) is not None
     with_runs, without = (load_merged([first, other], tmp_path) for other in (second, kept))
     assert (with_runs.protocol, with_runs.folder) == (without.protocol, without.folder)
     assert [run.checkpoints for run in with_runs.of("random")] == [run.checkpoints for run in without.of("random")]
@@ -212,6 +232,10 @@ def test_no_diagnostic_takes_the_place_of_a_column(tmp_path: Path) -> None:
     for name, text in archive_files(result).items():
         (tmp_path / name).write_text(text)
     again = load_so_far(tmp_path)
+    for line in csv.DictReader((tmp_path / "results.csv").read_text().splitlines()):
+        low, high = statistics.wilson(int(line["successes"]), int(line["test_episodes"]))
+        shown = [float(line[name]) for name in ("success_rate", "wilson_low", "wilson_high")]
+        assert shown == [int(line["successes"]) / 3, low, high]
     assert [(run.agent, run.seed) for run in again.runs] == [(run.agent, run.seed) for run in result.runs]
     for (_, row), (_, known) in zip(again.rows, result.rows, strict=True):
         assert row == known

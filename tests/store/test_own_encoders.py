@@ -83,6 +83,21 @@ def test_three_cubes_have_the_bundled_one(trained, name):
     assert place == encoders.bundled()["arrow_puzzle-clean"] and not trained
 
 
+def test_of_encoders_of_one_name_the_one_with_the_content_is_meant(tmp_path, monkeypatch):
+    """Such as those of two worlds, or of a bundled one and one that an earlier version had."""
+    monkeypatch.setenv("IMAGINE_BENCH_CACHE", str(tmp_path))
+    here = [encoders.bundled()["arrow_puzzle-clean"]]
+    for folder, of in (("a", "arrow_puzzle-mild"), ("b", "arrow_puzzle-strong")):
+        here.append(tmp_path / "encoders" / folder / here[0].name)
+        here[-1].parent.mkdir(parents=True)
+        shutil.copy(encoders.bundled()[of], here[-1])
+    for path in here:
+        assert encoders.find(encoders.identity(path)) == path
+        assert encoders.card(encoders.identity(path)) == encoders.card_of(path)
+    assert encoders.of_name(encoders.identity(here[0])) == here
+    assert encoders.find("arrow_puzzle-clean@0123456789ab") is None
+
+
 @pytest.mark.parametrize(("share", "doubted"), [(0.8999, True), (0.9, False)])
 def test_an_encoder_that_reads_few_frames_right_is_named(tmp_path, share, doubted):
     path = tmp_path / "theirs.safetensors"

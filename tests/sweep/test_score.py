@@ -42,6 +42,15 @@ def test_tests_alone_make_an_interval_that_covers():
     assert abs(covered / runs - 0.95) < 4 * math.sqrt(0.95 * 0.05 / runs) + 0.01
 
 
+def test_tests_of_all_seeds_widen_an_interval():
+    """Of 7 seeds of 10 tests each, which agree; shares are those of Agresti and Coull, with two more of each kind."""
+    found = score(np.tile([0.5, 0.8], (7, 1)), SCALES, trials=10)
+    first, second = ((70 * share + 2) / 74 for share in (0.5, 0.8))
+    variance = (first * (1 - first) / 70 / 0.8**2 + second * (1 - second) / 70 / 0.5**2) / 2**2
+    assert found.value == pytest.approx((0.4 / 0.8 + 0.3 / 0.5) / 2)
+    assert (found.high - found.value, found.value - found.low) == pytest.approx((1.959964 * math.sqrt(variance),) * 2)
+
+
 def test_a_level_without_values_is_left_out():
     rows = np.array([_row(0.3), _row(0.5)])
     rows[:, 1] = math.nan

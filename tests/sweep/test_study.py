@@ -161,7 +161,10 @@ def test_a_study_from_a_file_changes_the_world_too(tmp_path: Path) -> None:
     study = read_grid(path)
     assert (study.name, study.execution, study.variants[0].factor) == ("mine", "kinematic", BASE)
     run_study(study, "arrow_puzzle", root=tmp_path, launcher=launcher)
-    assert {job.spec.protocol.preset for job in launcher.jobs} == {"smoke"}
+    planned = [job.spec.protocol for job in launcher.jobs]
+    tests = [(each.budgets, each.evaluation_episodes, each.recorded_episodes) for each in planned]
+    assert tests == [((2,), 2, 0)] * 3 and [each.open_loop_starts for each in planned] == [0, 5, 0]
+    assert {(each.preset, each.seeds) for each in planned} == {("smoke", (1000,))}
     worlds = [(job.spec.protocol.appearance_in_words, job.spec.protocol.world) for job in launcher.jobs]
     assert worlds == [
         ("clean", {"execution": "kinematic"}), ("clean, tested at strong", {"execution": "kinematic"}),

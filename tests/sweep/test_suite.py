@@ -101,6 +101,17 @@ def test_rows_name_the_seeds_of_their_benches(tmp_path):
     assert {(row["task"], row["cpu_s"]) for row in rows} == {("arrows", "12.3")}
 
 
+def test_a_level_of_several_budgets_counts_at_the_last(tmp_path):
+    level = Level(name="3", task="arrows", episodes=30, protocol={"budgets": [2, 30]})
+    size = dataclasses.replace(TINY.experiments[1], levels=(level,))
+    suite = dataclasses.replace(TINY, seeds=(0,), evaluation_episodes=40, experiments=(size,))
+    (found,) = run_suite(suite, ("table",), root=tmp_path, launcher=Inline()).levels["size", "table"]
+    (run,) = load_bench(tmp_path / found.benches[0]).runs
+    first, last = run.checkpoints
+    assert (found.values.tolist(), found.train_cpu_s) == ([last.success_rate], last.train_cpu_s)
+    assert first.success_rate != last.success_rate
+
+
 def test_experiments_share_a_level(result, root):
     (size,) = result.levels["size", "table"]
     stochasticity, _ = result.levels["stochasticity", "table"]
@@ -176,7 +187,9 @@ def test_any_change_of_any_level_changes_the_hash():
         levels = (*first.levels[:-1], dataclasses.replace(first.levels[-1], **change))
         changed = dataclasses.replace(first, levels=levels)
         hashes.add(dataclasses.replace(GRIDS[SUITE], experiments=(changed, *others)).hash)
-    assert len(hashes) == 5
+    for change in ({"seeds": (2,)}, {"evaluation_episodes": 7}, {"execution": "physics"}, {"hyperparameters": "own"}):
+        hashes.add(dataclasses.replace(GRIDS[SUITE], **change).hash)
+    assert len(hashes) == 9
 
 
 def test_every_level_is_a_world_in_which_something_can_be_learned():

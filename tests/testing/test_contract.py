@@ -15,6 +15,7 @@ from imagine_bench.tasks.arrows.rules import ArrowRules
 from imagine_bench.tasks.macro_env import MacroEnv
 
 from imagine_bench import registry
+from imagine_bench.errors import ImagineBenchError
 from imagine_bench.interfaces import AgentContext, AgentState
 from imagine_bench.testing.checks import AGENT_CHECKS, same_state
 from imagine_bench.testing.contract import Checks, checks, report
@@ -245,6 +246,24 @@ class _NumpyValues(_Sound):
     def state(self) -> AgentState:
         state = super().state()
         return AgentState(arrays=state.arrays, values={**state.values, "count": np.int64(1)})
+
+
+class _Five(_Sound):
+    """Acts in a way that three cubes have, and two have not."""
+
+    def act(self, observation: Any, *, explore: bool) -> int:
+        return 5
+
+
+@pytest.mark.usefixtures("own_names")
+def test_an_agent_is_checked_in_the_task_that_is_named() -> None:
+    make = f"{__name__}:_Five"
+    registry.AGENTS["dqn"] = dataclasses.replace(registry.AGENTS["dqn"], make=make, needs_encoder=False)
+    found = checks(task="arrows:cubes=2", agent="dqn")
+    for what in ("it acts and learns", "taken up", "watched episodes", "the option feedback has"):
+        (check,) = (check for words, check in found.items() if words.startswith(what))
+        with pytest.raises(ImagineBenchError, match="Action 5 does not exist"):
+            check()
 
 
 def _none(context: AgentContext) -> None:

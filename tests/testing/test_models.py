@@ -10,6 +10,7 @@ import pytest
 from imagine_bench.agents.world_models.limits import Copy
 
 from imagine_bench import registry
+from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.model import Imagined
 from imagine_bench.testing.contract import checks
@@ -86,6 +87,7 @@ class _Drawn(_Wrong):
 def test_wrong_models_are_found(made: type, holds: str, words: str) -> None:
     copy = registry.WORLD_MODELS["copy"]
     registry.WORLD_MODELS["copy"] = dataclasses.replace(copy, make=f"{__name__}:{made.__name__}")
+    assert main(["check", "arrow_puzzle_easy", "--model", "copy"]) == 1
     found = checks(task="arrow_puzzle_easy", model="copy")
     for what, check in found.items():
         if what.startswith(holds):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -55,10 +56,12 @@ def test_changed_code_is_part_of_the_commit(tmp_path: Path) -> None:
     git("commit -qm x")
     head = commit_with("README.md", "words")
     assert head is not None and "+" not in head and head == commit_with("runs/x.py", "results")
-    edits = [("agents/a.py", "2"), ("agents/a.py", "3"), ("agents/new.py", "1"), ("agents/new.py", "2")]
+    new = ["agents/new.py", "tasks/new.py", "imagine_bench/new.py", "assets/new.xml", "pyproject.toml"]
+    edits = [("agents/a.py", "2"), ("agents/a.py", "3"), *((name, text) for name in new for text in "12")]
     seen = [commit_with(*edit) for edit in edits]
-    assert len(set(seen)) == 4 and all(str(each).startswith(f"{head}+changes.") for each in seen)
-    (tmp_path / "agents/new.py").unlink()
+    assert len(set(seen)) == 12 and all(str(each).startswith(f"{head}+changes.") for each in seen)
+    for name in new:
+        (tmp_path / name).unlink()
     assert commit_with("agents/a.py", "1") == head
     (tmp_path / ".git/index").write_bytes(b"damaged")  # git still knows the commit, and not what differs
     assert environment.commit(tmp_path) == f"{head}+changes.unknown"
@@ -99,12 +102,14 @@ def test_versions_that_are_not_the_locks_are_named(tmp_path: Path) -> None:
 def test_missing_gl_and_a_full_disk_are_complaints_and_exit_code_1(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(doctor, "machine", lambda: {**environment.machine(), "gpu": "a card"})
-    monkeypatch.setattr(doctor, "gl_renderer", lambda: "Mesa, llvmpipe")
-    assert main(["doctor"]) == 0
-    said = capsys.readouterr().out
-    assert "NVIDIA GPU" in said.partition("a card\n")[0].splitlines()[-1]
-    assert "Note: Frames are drawn in software (Mesa, llvmpipe) although there is a GPU; " in said
+    for gpu, gl in ((None, "Mesa, llvmpipe"), ("a card", "NVIDIA, a card"), ("a card", "Mesa, llvmpipe")):
+        monkeypatch.setattr(doctor, "machine", lambda gpu=gpu: {**environment.machine(), "gpu": gpu})
+        monkeypatch.setattr(doctor, "gl_renderer", lambda gl=gl: gl)
+        assert main(["doctor"]) == 0
+        said = capsys.readouterr().out
+        assert re.search(rf"^NVIDIA GPU +{gpu or 'none'}$", said, re.MULTILINE)
+        note = f"Note: Frames are drawn in software ({gl}) although there is a GPU; "
+        assert (note in said) == ("Note: Frames" in said) == (gpu is not None and "Mesa" in gl)
     monkeypatch.setattr(doctor, "gl_renderer", mock.Mock(side_effect=SetupError("No OpenGL: install libegl1.")))
     monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=2**29))
     assert main(["doctor"]) == 1

@@ -64,7 +64,10 @@ def test_bundled_encoder_reads_fresh_frames_as_its_card_says(task: str, appearan
 def test_an_encoder_of_other_preprocessing_is_refused(wrapped: bool) -> None:
     with closing(gymnasium.make("imagine_bench/PickPlace-v0", disable_env_checker=True)) as made:
         env = made if wrapped else made.unwrapped
-        assert LatentObservation(env, "pick_place-clean").observation_space.shape == (4,)
+        seen, encoder = LatentObservation(env, "pick_place-clean"), Encoder.load(bundled_encoder("pick_place-clean"))
+        assert seen.observation_space.shape == (4,)
+        frame, _ = env.reset(seed=0)
+        assert np.array_equal(seen.reset(seed=0)[0], encoder.encode(frame[None])[0][0].numpy())
         with pytest.raises(InvalidValueError, match="reads frames as 'gray_strips', this environment's task declares"):
             LatentObservation(env, "arrow_puzzle-clean")
 

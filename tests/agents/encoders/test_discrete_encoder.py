@@ -9,27 +9,31 @@ from imagine_bench.agents.encoders.discrete_encoder import DiscreteEncoder, clou
 
 from imagine_bench.errors import InvalidValueError
 
-SIDE = 24
+HEIGHT, WIDTH = 22, 24
 
 
 def box(top: float, left: float, height: float, width: float) -> np.ndarray:
     """How much of each pixel a rectangle covers."""
-    pixel = np.arange(SIDE)
-    rows = np.clip(np.minimum(pixel + 1, top + height) - np.maximum(pixel, top), 0.0, 1.0)
-    columns = np.clip(np.minimum(pixel + 1, left + width) - np.maximum(pixel, left), 0.0, 1.0)
-    return np.outer(rows, columns)
+    sides = []
+    for begin, length, pixel in ((top, height, np.arange(HEIGHT)), (left, width, np.arange(WIDTH))):
+        sides.append(np.clip(np.minimum(pixel + 1, begin + length) - np.maximum(pixel, begin), 0.0, 1.0))
+    return np.outer(*sides)
 
 
 def images(n: int, rng: np.random.Generator, jitter: float = 0.3) -> tuple[torch.Tensor, np.ndarray]:
-    """Two independent objects that jitter: a bar that lies in 3 ways at the top, a dot in 2 places at the bottom."""
+    """Two independent objects that jitter: a bar that lies in 3 ways at the top, a dot in 2 places at the bottom.
+
+    A second channel shows them mirrored.
+    """
     values = np.stack([rng.integers(3, size=n), rng.integers(2, size=n)], axis=1)
-    frames = np.full((n, 1, SIDE, SIDE), 0.5, dtype=np.float32)
+    frames = np.full((n, 1, HEIGHT, WIDTH), 0.5, dtype=np.float32)
     for index, (bar, dot) in enumerate(values.tolist()):
         top, left, height, width = [(2, 2, 2, 8), (2, 13, 2, 8), (0, 10, 10, 2)][bar]
         frames[index] += 0.3 * box(top + jitter * rng.normal(), left + jitter * rng.normal(), height, width)
         frames[index] -= 0.3 * box(17 + jitter * rng.normal(), 4 + 12 * dot + jitter * rng.normal(), 4, 4)
     light = rng.uniform(0.9, 1.1, size=(n, 1, 1, 1)).astype(np.float32)
-    return torch.from_numpy(np.clip(frames * light, 0.0, 1.0)), values
+    lit = np.clip(frames * light, 0.0, 1.0)
+    return torch.from_numpy(np.concatenate([lit, lit[..., ::-1]], axis=1)), values
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +60,7 @@ def test_a_code_is_decoded_to_how_its_values_look(found: DiscreteEncoder) -> Non
 
 def test_still_images_have_no_factors() -> None:
     with pytest.raises(InvalidValueError, match="No factor with two values"):
-        discover(torch.full((50, 1, SIDE, SIDE), 0.5), torch.Generator().manual_seed(0))
+        discover(torch.full((50, 1, HEIGHT, WIDTH), 0.5), torch.Generator().manual_seed(0))
 
 
 def test_dependence_sees_what_correlation_does_not() -> None:

@@ -14,7 +14,7 @@ import pytest
 import torch
 from encoder_frames import CHAPTER_5, QUICK, TINY, TINY_CONV, arrow_spec, draw
 from imagine_bench.agents.encoders import perception, training
-from imagine_bench.agents.encoders.cli import retrain, sample_sheet
+from imagine_bench.agents.encoders.cli import compare, retrain, sample_sheet
 from imagine_bench.agents.encoders.encoder import Encoder, EncoderCard
 from imagine_bench.agents.encoders.probe import Latents
 from imagine_bench.agents.encoders.recipes import Recipe, recipe_named
@@ -50,8 +50,8 @@ def frames(n: int, appearance: str = "mild") -> np.ndarray:
     return draw_frames(arrow_spec(), appearance, n, np.random.default_rng(0))[0]
 
 
-def trained(recipe: Recipe, seed: int = 0, **how: Any) -> Encoder:
-    return train_encoder(arrow_spec(), recipe=recipe, appearance="mild", seed=seed, **how)
+def trained(recipe: Recipe, seed: int = 0, appearance: str = "mild", **how: Any) -> Encoder:
+    return train_encoder(arrow_spec(), recipe=recipe, appearance=appearance, seed=seed, **how)
 
 
 @pytest.fixture(scope="module")
@@ -214,8 +214,9 @@ def test_killed_training_goes_on_to_the_same_bits(tmp_path: Path, monkeypatch: p
     assert np.array_equal(theirs, np.random.get_state()[1])  # noqa: NPY002
     assert torch.equal(weights(whole), weights(again))
     assert replace(again.card, cpu_s={}) == replace(whole.card, cpu_s={})
-    with pytest.raises(ArtefactError, match="is of another training; remove it or choose"):
-        trained(QUICK, seed=1, unfinished=file)
+    for other in ({"seed": 1}, {"appearance": "clean"}, {"recipe": replace(QUICK, beta=9.0)}):
+        with pytest.raises(ArtefactError, match="is of another training; remove it or choose"):
+            trained(**{"recipe": QUICK, **other}, unfinished=file)
     file.write_bytes(file.read_bytes()[:5000])
     with pytest.raises(ArtefactError, match=r"unfinished\.pt is damaged; remove it to begin anew"):
         trained(QUICK, unfinished=file)
@@ -362,7 +363,14 @@ def test_retrain_leaves_three_files_and_never_overwrites(tmp_path: Path, monkeyp
     path = tmp_path / "drawn_arrows-mild.safetensors"
     card = Encoder.load(path).card
     assert f"Wrote {path}" in text
-    assert f"mlp {card.probe['mlp']:.2%}" in text
+    shares = {"linear": 0.5, "mlp": 0.75, "mlp_sampled": 0.12345}
+    bundled = replace(card, seed=4, latent_size=7, probe=shares, kl_nats=2.34, cpu_s={"total": 98.7})
+    assert compare(card, None) == text.splitlines()[1] and f"mlp {card.probe['mlp']:.2%}" in text
+    assert compare(card, bundled).splitlines() == [
+        text.splitlines()[1],
+        "bundled: recipe quick, seed 4, 7 latents; of 30 held-out frames read right: linear 50.00%, mlp 75.00%, "
+        "mlp_sampled 12.35%; 2.3 nats from the prior, 99 CPU s.",
+    ]
     assert (card.recipe.steps, card.recipe.batch, card.recipe.latents) == (QUICK.steps, 9, 11)
     assert card.data.startswith("60 training and 30 held-out frames")
     command = "imagine-bench encoder --task drawn_arrows --appearance mild --recipe quick --seed 1"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -48,6 +49,23 @@ def test_a_failed_run_is_named_and_stops_no_other(name: str, tmp_path: Path) -> 
     assert [(progress.seed, progress.detail) for progress in told if progress.phase == "failed"] == [
         (1, failure.reason)
     ]
+
+
+_PRINTS = """
+import pickle, sys
+from imagine_bench.running.launchers.jobs import carry_out
+for job in pickle.load(sys.stdin.buffer):
+    carry_out(job, print, lambda job, tell: print("said by", job.spec.seed))
+"""
+
+
+def test_what_a_run_prints_is_in_its_own_log(tmp_path: Path) -> None:
+    """Also where a process carries out several, and keeps lines back."""
+    jobs = [job(tmp_path, "random", seed) for seed in (0, 1)]
+    environment = {**os.environ, "PYTHONPATH": str(_HERE), "PYTHONUNBUFFERED": ""}
+    subprocess.run([sys.executable, "-c", _PRINTS], input=pickle.dumps(jobs), env=environment, check=True)
+    said = [[line for line in each.log.read_text().splitlines() if line.startswith("said")] for each in jobs]
+    assert said == [["said by 0"], ["said by 1"]]
 
 
 def test_an_observer_that_fails_is_not_taken_for_a_run_that_did(tmp_path: Path) -> None:

@@ -60,13 +60,19 @@ def test_a_worker_needs_no_script_and_knows_what_it_registers(tmp_path: Path, mo
 
 _REGISTERS = """
 from dataclasses import replace
-from imagine_bench.registry import AGENTS
+from imagine_bench.registry import AGENTS, REGRESSIONS, REGRESSORS, TASKS, WORLD_MODELS, RegressorEntry
 from imagine_bench.registry.loading import register, registered
-AGENTS["mine"] = replace(AGENTS["random"], make="__main__:make")
+AGENTS["mine"] = replace(AGENTS["random"], make="__main__:make", settings="__main__:SETTINGS")
+REGRESSIONS["mine"] = "__main__:DATA"
+REGRESSORS["mine"] = RegressorEntry(make="__main__:learn", title="", description="")
+TASKS["mine"] = replace(TASKS["arrow_puzzle"], spec="__main__:SPEC", env="__main__:Env")
+WORLD_MODELS["mine"] = replace(WORLD_MODELS["copy"], make="__main__:model")
 there = registered()
-del AGENTS["mine"]
+for table in (AGENTS, REGRESSIONS, REGRESSORS, TASKS, WORLD_MODELS):
+    del table["mine"]
 register(there)
-print(AGENTS["mine"].make, AGENTS["random"].make)
+print(AGENTS["mine"].make, AGENTS["mine"].settings, REGRESSIONS["mine"], REGRESSORS["mine"].make, TASKS["mine"].spec)
+print(TASKS["mine"].env, WORLD_MODELS["mine"].make, AGENTS["random"].make)
 """
 
 
@@ -81,7 +87,8 @@ def test_main_gets_the_name_that_others_import(words: list[str], name: str, tmp_
     done = subprocess.run(
         [sys.executable, *words], cwd=tmp_path, input=given, capture_output=True, text=True, check=True
     )
-    assert done.stdout.split() == [f"{name}:make", AGENTS["random"].make]
+    mine = ("make", "SETTINGS", "DATA", "learn", "SPEC", "Env", "model")
+    assert done.stdout.split() == [*(f"{name}:{each}" for each in mine), AGENTS["random"].make]
 
 
 def test_a_module_that_runs_a_command_when_imported_is_named(guests: Guests) -> None:
