@@ -61,7 +61,7 @@ from imagine_bench.store.results import BenchResult
 
 _EQUAL_UPDATES = "dqn_more_updates"
 _UNTIL = " --until-decided"
-_SEEDS_OPTION = re.compile(r" --seeds[ =]\d[\d-]*(?: \d[\d-]*)*")
+_SEEDS_OPTION = re.compile(r" --until-decided| --(?:most-)?seeds[ =]\d[\d-]*(?: \d[\d-]*)*")
 
 
 def bench_page(result: BenchResult) -> Page:
@@ -183,7 +183,7 @@ def _undecided(data: ReportData, agent: str, base: str, more: int) -> str:
     if not command.startswith("imagine-bench bench ") or ";" in command:
         return words
     if (agent, base) in protocol.headlines and " --agents " not in command:
-        return f"{words}: {command.removesuffix(_UNTIL)}{_UNTIL}"
+        return f"{words}: {command.replace(_UNTIL, '')}{_UNTIL}"
     command = _SEEDS_OPTION.sub("", command)
     if fewer in dict(protocol.few_seeds):
         command += f" --agents {base} {agent}"

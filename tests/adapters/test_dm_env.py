@@ -128,21 +128,25 @@ def test_a_copy_plays_on_and_shows_its_own_scene(copied):
 
 def test_motion_turns_the_cube_before_the_reward():
     env = as_dm_env(ARROWS, seed=0, motion_hz=10)
-    start, yaws, steps = env.reset(), [], []
+    start, yaws, steps, times_s = env.reset(), [], [], []
     while not steps or steps[-1].reward == 0.0:  # every macro-action has a reward
         steps.append(env.step(0))
+        times_s.append(env.physics.data.time)
         yaws.append(np.arctan2(*env.physics.named.data.xmat["cube_0"][[3, 0]]))
     assert 10 < len(steps) < 60
     assert all(step.mid() and step.observation is start.observation for step in steps[:-1])
     turned = np.abs((np.array(yaws) - yaws[0] + np.pi) % (2 * np.pi) - np.pi)
     assert turned[-1] == pytest.approx(np.pi / 2, abs=np.radians(5))
     assert ((turned > 0.3) & (turned < 1.3)).any()
+    assert times_s == sorted(times_s) and times_s[-1] == env.info["sim_time_s"] and np.diff(times_s).max() < 0.11
     env.reset()
     assert env.step(0).mid()
     assert env.reset().first(), "in the middle of a motion"
-    step = env.step(1)
+    step, begun_s = env.step(1), env.physics.data.time
+    assert begun_s > times_s[-1], "the clock goes on over episodes"
     while step.reward == 0.0:  # of no first step, whose reward is None, and of no old motion
         step = env.step(1)
+    assert env.physics.data.time == pytest.approx(begun_s + env.info["sim_time_s"])
     assert not step.first() and step.reward in (-5.0, -1.0, 50.0)
     env.close()
 

@@ -73,9 +73,6 @@ def test_one_seed_is_one_content_and_another_is_another() -> None:
     assert first.hash == again.hash != other.hash
     longer, _, _ = collected(episodes=6)
     assert np.array_equal(longer.frames[: len(first.frames)], first.frames), "more episodes begin with the same"
-
-
-def test_starts_macro_actions_and_chance_all_follow_from_the_seed() -> None:
     (one, hidden, _), (other, others, _) = (collected("uniform", 6, seed) for seed in (0, 1))
     assert not np.array_equal(one.actions, other.actions)
     for name in ("macrostates", "seeds"):

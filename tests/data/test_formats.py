@@ -20,9 +20,10 @@ from small_runs import FORMATS, collected, exact, written
 from imagine_bench import registry
 from imagine_bench.arrays import content_hash
 from imagine_bench.data import lerobot
-from imagine_bench.data.folder import read_apart, read_dataset
-from imagine_bench.errors import ArtefactError
+from imagine_bench.data.folder import read_apart, read_dataset, require_fits
+from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces.episodes import Episodes
+from imagine_bench.running.collect import describe
 from imagine_bench.store.files import make_folder, write_json
 
 _DATA = "data/chunk-000/file-000.parquet"
@@ -93,6 +94,14 @@ def test_a_set_of_others_is_read_without_a_card(tmp_path: Path, monkeypatch: pyt
         found = read_dataset(folder)
         assert found.card is None and found.identity.startswith("foreign-2@")
         assert np.array_equal(found.episodes.frames[: len(buffers[0]) + 1], buffers[0].observations)
+        said = describe(found)
+        assert (
+            f"2 of {sum(map(len, buffers))} transitions, as minari\n" in said
+            and "none: it is not of this suite" in said
+        )
+        require_fits(found, registry.task("arrow_puzzle"), "strong")  # nothing says how its frames look
+        with pytest.raises(InvalidValueError, match="is of a task with 6 macro-actions; give one of pick_place"):
+            require_fits(found, registry.task("pick_place"), "strong")
 
 
 # --- LeRobot ---------------------------------------------------------------------------------------------------------

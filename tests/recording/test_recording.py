@@ -8,6 +8,7 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -136,11 +137,15 @@ def test_the_first_solved_and_lost_episodes_are_kept(tmp_path: Path, action: int
 
 
 def test_several_rollouts_are_shown_only_where_rules_are_random(imagined: Path, tmp_path: Path) -> None:
+    """In physics the clock goes on as long as each macro-action takes."""
     with closing(gymnasium.make("imagine_bench/PickPlace-v0")) as env:
         path = tmp_path / "chance.rrd"
         record_run(
             "pick_place", _HandsOver(), name="imagination", seed=0, env=env, appearance="clean", episodes=1, path=path
         )
+        scene: Any = env.unwrapped
+        acted = [at.total_seconds() for at in sorted(times(path, "/real/reward", "sim_time"))]
+        assert np.diff(acted, prepend=0.0)[-1] == pytest.approx(scene.motion().time_s[-1]) != 1.0
     assert contents(path)["/imagined/sampled_rollouts"] >= {"sim_time", "env_step", "episode"}
     assert "/imagined/sampled_rollouts" not in contents(imagined)
 
@@ -291,33 +296,81 @@ def test_compared_rollouts_are_as_late_and_hidden_as_frames(before: int) -> None
         assert compared.real_macrostates[depth].tolist() == [*directions, read]
 
 
+def test_bars_of_a_rollout_that_ends_early_keep_their_places(tmp_path: Path) -> None:
+    class Short(FakeImaginer):
+        def imagine(
+            self, frame: Frame, *, actions: NDArray[np.int64] | None, depth: int, rng: np.random.Generator
+        ) -> ImaginedRollout:
+            return super().imagine(frame, actions=actions, depth=2, rng=rng)
+
+    path = record(Short(), tmp_path / "short.rrd", episodes=1)
+    for kind, second in (("epistemic", 0.1), ("aleatoric", 0.05), ("modal", 0.01)):
+        values = by_step(path, f"/imagined/uncertainty/{kind}", "BarChart:values")[0]
+        assert values["buffer"] == pytest.approx([0.0, second, 0.0, 0.0, 0.0, 0.0])
+
+
+class _Remembers(FakeAgent):
+    """Turns a cube back and forth, and recalls values that follow from the frame."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.turns = itertools.cycle((4, 5))
+
+    def act(self, observation: Observation, *, explore: bool) -> int:
+        return next(self.turns)
+
+    def read_memory(self, frame: Frame, counts: Sequence[int]) -> NDArray[np.int64]:
+        return np.array([int(frame.sum()) % count for count in counts])
+
+
+class _Faults(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Says of macro-actions without a success that they went wrong."""
+
+    def step(self, action: Any) -> Any:
+        *step, info = self.env.step(action)
+        fault = {} if info["is_success"] else {"fault": True, "fault_reason": "it slipped"}
+        return *step, {**info, **fault}
+
+
 @pytest.mark.parametrize("observation", ["frame", "state,proprio"])
 def test_a_recording_shows_what_the_agent_sees_and_says_what_is_true(tmp_path: Path, observation: str) -> None:
     """Frames are those of another environment, played the same way, which delivers them two macro-actions late; of an
-    agent that sees no frames, too.
+    agent that sees no frames, too. Faults are named, and what an agent remembers of what it does not see.
     """
     task, options = "arrows:gesture=first,lag=2", {"gesture": "first", "lag": 2, "execution": "kinematic"}
     path = tmp_path / "late.rrd"
     with closing(gymnasium.make("imagine_bench/Arrows-v0", observation=observation, **options)) as env:
-        record_run(task, FakeAgent(), name="random", env=env, path=path, seed=3, appearance="clean", episodes=1)
-    with closing(gymnasium.make("imagine_bench/Arrows-v0", **options)) as env:
-        frame, info = env.reset(seed=episodes.episode_seed("recording", 3, 1))
-        agent, frames, infos, over = FakeAgent(), [frame], [info], False
+        given: dict[str, Any] = {"name": "random", "env": _Faults(env), "seed": 6, "appearance": "clean", "episodes": 1}
+        record_run(task, _Remembers(), path=path, **given)
+    spec = registry.task(task)
+    with closing(_Faults(gymnasium.make("imagine_bench/Arrows-v0", **options))) as env:
+        frame, info = env.reset(seed=episodes.episode_seed("recording", 6, 1))
+        agent, frames, infos, over = _Remembers(), [frame], [info], False
+        headings, lasts = ["### Episode 1: a new start"], []
         while not over:
             action = agent.act(Observation(frame=frame, macrostate=None), explore=False)
-            frame, _, terminated, truncated, info = env.step(action)
+            frame, reward, terminated, truncated, info = env.step(action)
             frames, infos, over = [*frames, frame], [*infos, info], terminated or truncated
+            words = f"Done: {spec.action_names[action]}. Reward {reward:+g}." + " Fault: it slipped." * int(
+                info["fault"]
+            )
+            headings.append(f"### Episode 1, after macro-action {len(headings)}\n\n{words}")
+            lasts.append(f"Next: {spec.action_names[action]}.")
+        lasts.append(f"{ending(info, terminated=terminated).capitalize()}.")
     shown = np.array(by_step(path, "/real/frame", "Image:buffer"), np.uint8)
     differ = (shown.reshape(-1, 64, 64, 3) != frames).any(axis=3).mean(axis=(1, 2))
     most = 0.0 if observation == "frame" else 0.1  # objects stand a little elsewhere; another arrow is 0.14
     assert (differ <= most).all(), differ
     texts = by_step(path, "/real/text", "TextDocument:text")
-    spec = registry.task(task)
-    for text, info in zip(texts, infos, strict=True):
-        truth, seen = (spec.value_names(info[each]) for each in ("macrostate", "shown"))
-        for name, now, late in zip(spec.macrostate_names, truth, seen, strict=True):
-            assert f"- {name}: {now}{'' if now == late else f' (frame: {late})'}\n" in text
-    assert "(frame: " in "".join(texts) and "(frame: " not in texts[0]
+    counts = [len(values) for values in spec.macrostate_values]
+    for text, info, frame, heading, last in zip(texts, infos, frames, headings, lasts, strict=True):
+        recalled = agent.read_memory(frame if observation == "frame" else frame[:0], counts)
+        lines = ""
+        named = map(spec.value_names, (info["macrostate"], info["shown"], recalled))
+        for name, now, late, memory in zip(spec.macrostate_names, *named, strict=True):
+            lines += f"- {name}: {now}{'' if now == late else f' (frame: {late}; memory: {memory})'}\n"
+        assert text == f"*{spec.description}*\n\n{heading}\n\n{lines}\n\n**{last}**"
+    assert "(frame: " in "".join(texts) and "(frame: " not in texts[0] and "Fault" in texts[1]
     assert not any(each.startswith(("/imagined", "/real/q_")) for each in contents(path)), "it does neither"
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_results import bench_result, compared_rollout
+from fake_results import bench_result, compared_rollout, rewritten
 from PIL import Image
 
 from imagine_bench import registry
@@ -121,67 +121,63 @@ def recorded(length: int, success: bool) -> RecordedEpisode:
     )
 
 
-@pytest.mark.parametrize("length", [1, 3, 6])
-def test_an_episode_s_strip_shows_every_frame_and_the_end(length: int) -> None:
-    success = length != 3
-    episode = recorded(length, success)
-    strip = filmstrips.episode_strip(episode, PICK_PLACE.action_names)
-    assert colored(strip) == [success, not success]
-    cells = [np.argwhere((strip == frame[0, 0]).all(axis=-1)) for frame in episode.frames]
-    assert all(len(cell) == CELL_PX**2 for cell in cells), "each frame once, whole"
-    places = [tuple(cell[0]) for cell in cells]
-    assert places == sorted(places) and strip.shape[1] < 700, "in order, and it fits a page"
-
-
-def test_the_rewards_of_an_episode_are_shown_with_their_fractions() -> None:
-    """As they are where chance changes rewards."""
-    assert [filmstrips.signed(reward) for reward in (-1.5, -0.5, 50.0, 0.0, -1.234)] == [
-        *("-1.5", "-0.5", "+50", "+0", "-1.23")
-    ]
-
-
 def numbered(actions: list[int]) -> list[Tile]:
     """The words above the images of an episode."""
     words = [f"{step}. {PICK_PLACE.action_names[action]}" for step, action in enumerate(actions, 1)]
     return [Tile(None, above) for above in ("start", *words)]
 
 
-def test_the_macro_actions_of_an_episode_stand_with_their_rewards() -> None:
-    episode = dataclasses.replace(recorded(3, success=True), rewards=np.array([-1.5, -0.5, 50.0]))
-    below = ["", "reward -1.5", "reward -0.5", "reward +50\nsolved"]
-    tiles = zip(numbered([0, 1, 2]), episode.frames, below, strict=True)
+@pytest.mark.parametrize("length", [1, 4, 6])
+def test_an_episode_s_strip_shows_every_frame_macro_action_and_reward_and_the_end(length: int) -> None:
+    """Rewards with their fractions, as they are where chance changes them; four frames a row."""
+    success = length != 4
+    rewards = {"-1.5": -1.5, "+0": 0.0, "-1.23": -1.234, "+50": 50.0, "-0.5": -0.5, "+2": 2.0}
+    episode = dataclasses.replace(recorded(length, success), rewards=np.array([*rewards.values()][:length]))
+    below = ["", *(f"reward {reward}" for reward in [*rewards][:length])]
+    below[-1] += "\nsolved" if success else "\nlost, because no\nmacro-actions are\nleft"
+    tiles = zip(numbered(episode.actions.tolist()), episode.frames, below, strict=True)
     expected = [tile._replace(frame=frame, below=words) for tile, frame, words in tiles]
-    expected[-1] = expected[-1]._replace(right=True)
+    expected[-1] = expected[-1]._replace(right=success)
     strip = filmstrips.episode_strip(episode, PICK_PLACE.action_names)
-    np.testing.assert_array_equal(strip, filmstrips.sheet([("real frames", expected)]))
+    rows = [("" if first else "real frames", expected[first : first + 4]) for first in range(0, length + 1, 4)]
+    np.testing.assert_array_equal(strip, filmstrips.sheet(rows, columns=4))
+    assert colored(strip) == [success, not success] and strip.shape[1] < 700, "it fits a page"
 
 
 def test_the_macro_actions_of_an_overrated_policy_are_numbered_from_one() -> None:
-    believed, real = [(0, 0.0, False), (2, 10.0, True)], [(0, 0.0, False), (1, -1.0, False), (3, -1.0, True)]
+    believed, real = [(0, 0.0, False), (2, 10.0, True)], [(0, 0.0, False), (1, -1.0, True), (3, -2.5, False)]
+    below = [["", "reward 0.000", "reward 10.0\nthe end"]]
+    below.append(["", "reward 0.000", "reward \u22121.00\nthe end", "reward \u22122.50"])
     film = {"start": "here", "returns": (10.0, -2.0), "believed": believed, "real": real}
-    frames = {f"film_{name}": np.zeros((4, 64, 64, 3), dtype=np.uint8) for name in ("believed", "real")}
-    frames["film_believed"] = frames["film_believed"][:3]
+    ways = (("believed", 1), ("real", -1))
+    frames = {f"film_{name}": recorded(len(film[name]), success=True).frames[::way] for name, way in ways}
     image = film_image("exact", "the model", PICK_PLACE, film, frames)
+    rows = []
+    for name, words, lines in zip(("believed", "real"), ("the model believes", "the world does"), below, strict=True):
+        tiles = zip(numbered([action for action, *_ in film[name]]), frames[f"film_{name}"], lines, strict=True)
+        rows.append((words, [tile._replace(frame=frame, below=line) for tile, frame, line in tiles]))
     shown = np.asarray(Image.open(io.BytesIO(image.png)).convert("RGB"))
-    for row, course in zip(np.array_split(shown, 2), (believed, real), strict=True):
-        expected = filmstrips.sheet([("", numbered([action for action, *_ in course]))], columns=4)
-        np.testing.assert_array_equal(row[:TITLE_PX], expected[:TITLE_PX])
+    np.testing.assert_array_equal(shown, filmstrips.sheet(rows))
+    assert "from here: expected return 10.0 in the model and \u22122.00 in the world" in image.caption
 
 
 def test_a_report_begins_with_a_solved_and_a_lost_episode(tmp_path: Path) -> None:
-    protocol = Protocol(task="pick_place", preset="quick", agents=("random", "dqn"), seeds=(0, 1), budgets=(5,))
+    scores = {"random": 9, "dqn": 1, "imagination_only": 5}
+    protocol = Protocol(task="pick_place", preset="quick", agents=tuple(scores), seeds=(0, 1), budgets=(5,))
     plain = bench_result(tmp_path, protocol=protocol)
+    plain = rewritten(plain, lambda run, row: dataclasses.replace(row, successes=scores[run.agent]))
     assert not any(section.links for section in bench_page(plain).sections), "older runs kept no episodes"
+    best = "imagination_only"
     for failures, captions in (([], "random, seed 0"), ([False], "dqn, seed 1")):
-        shown = {("random", 0): [True, False], ("dqn", 0): [True], ("dqn", 1): [True, *failures]}
+        shown = {("random", 0): [True, False], ("dqn", 0): [True], ("dqn", 1): [True, *failures], (best, 1): [True]}
         runs = []
         for run in plain.runs:
             episodes = shown.get((run.agent, run.seed), ())
             runs.append(dataclasses.replace(run, recorded=tuple(recorded(2, solved) for solved in episodes)))
         first = bench_page(dataclasses.replace(plain, runs=tuple(runs))).sections[0]
         solved, lost = first.images
-        assert solved.caption == "dqn, seed 0: solved." and lost.caption.startswith(f"{captions}: lost, because")
-        folders = ("dqn/seed_0", "dqn/seed_1", "random/seed_0")
+        assert solved.caption == f"{best}, seed 1: solved." and lost.caption.startswith(f"{captions}: lost, because")
+        folders = (f"{best}/seed_1", "dqn/seed_0", "dqn/seed_1", "random/seed_0")
         assert list(first.links.values()) == [f"../{folder}/recording.rrd" for folder in folders]
 
 
@@ -202,7 +198,8 @@ def test_impossible_steps_are_marked_unless_frames_hide_something() -> None:
         Tile(rgb(ends.frames[0]), PICK_PLACE.action_names[0], "left object\npicked, gesture\nright", right=True),
         Tile(rgb(ends.frames[1]), PICK_PLACE.action_names[0], "middle object\npicked; the end", right=False),
     ]
-    shown = sampled_filmstrips((dataclasses.replace(right, rollout=ends),), PICK_PLACE)
-    np.testing.assert_array_equal(shown, filmstrips.sheet([("the real start", told)]))
+    shown = sampled_filmstrips((dataclasses.replace(right, rollout=ends),) * 2, PICK_PLACE)
+    again = ("the same start, imagined again", [Tile(None), *told[1:]])
+    np.testing.assert_array_equal(shown, filmstrips.sheet([("the real start", told), again]))
     assert colored(sampled_filmstrips((wrong,), PICK_PLACE)) == [False, True]
     assert colored(sampled_filmstrips((right, wrong), hidden)) == [False, False]

@@ -21,7 +21,7 @@ from imagine_bench.protocols.control import Protocol
 from imagine_bench.registry.entries import FIRST, TODAY
 from imagine_bench.report.bench import bench_page, shown, verdict
 from imagine_bench.report.data import DIFFERENCE, SCORE, collect
-from imagine_bench.report.page import Page, Table, number, p_level, write_page
+from imagine_bench.report.page import Page, Table, mean_std, number, over_seeds, p_level, write_page
 from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
 
 
@@ -40,6 +40,18 @@ def test_a_number_is_printed_to_three_digits(value: float, words: str) -> None:
 def test_a_p_value_is_said_to_be_below_the_next_level() -> None:
     words = ["p < .001", "p < .01", "p < .05", "p < .05", "p < 1.01"]
     assert [p_level(p) for p in (0.0009, 0.001, 0.01, 0.0499, 0.05)] == words
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        *(((math.nan,), "–"), ((0.25,), "25.0"), ((0.5, math.nan, 0.7), "60.0 (50.0 to 70.0)")),
+        *(((0.5, 0.5, math.nan), "50.0"), ((0.0, 0.6, 0.8, 0.8), "70.0 / 55.0 (0.0 to 80.0)")),
+    ],
+)
+def test_numbers_of_seeds_are_of_those_that_have_one(values: tuple[float, ...], words: str) -> None:
+    assert over_seeds(values) == words
+    assert [mean_std(each) for each in ([1.0, 2.0], [1.0], [1.0, math.nan])] == ["1.50 (0.71)", "1.00", "–"]
 
 
 def test_columns_for_a_terminal_are_at_most_80_characters_wide() -> None:
@@ -110,6 +122,11 @@ def test_verdicts(many: BenchResult, result: BenchResult, headed: BenchResult, e
     later = zip(better.runs, equal.runs, strict=True)
     runs = [dataclasses.replace(one, checkpoints=other.checkpoints[:1] + one.checkpoints[1:]) for one, other in later]
     three = shifted(result, dqn=[100, 102, 104], imagination=[198, 199, 200])
+    page = bench_page(three)
+    assert table(page, "gains").caption.startswith("Too few seeds to say")
+    rows = list(csv.DictReader(io.StringIO(page.files["summary.csv"])))
+    assert {row["interval_over"] for row in rows} == {"too few seeds"}
+    assert all(row[name] in ("", "nan") for row in rows for name in (*SCORE[1:], *DIFFERENCE[1:], "p_holm"))
     typed = {**three.environment, "command": "imagine-bench bench x --seeds 0-1 7 --workers 1"}
     few = dataclasses.replace(headed.protocol, headlines=PAIRS[1:], few_seeds=(("imagination", 4),))
     levels = [100, 140, 100, 120, 130, 110, 120]
@@ -130,6 +147,13 @@ def test_verdicts(many: BenchResult, result: BenchResult, headed: BenchResult, e
     same = {**three.environment, "command": "imagine-bench bench x --seeds=0-1 7 --workers 1"}
     first, other = (verdict(collect(dataclasses.replace(three, environment=each))) for each in (typed, same))
     assert first == other, "seeds are typed in two ways"
+    scene, until = scenes["an undecided headline"], "imagine-bench bench --task arrow_puzzle --until-decided"
+    for command in (until, f"{until} --most-seeds 7", f"{until} --workers 1"):
+        begun = dataclasses.replace(scene, environment={"command": command})
+        own, with_agents = re.findall(r"decide: (imagine-bench [^;]*?)[;.]", verdict(collect(begun))[0])
+        assert own.count("--until-decided") == 1 and "decided" not in with_agents and "most" not in with_agents, (
+            "which the command refuses beside --agents"
+        )
     for command in ("imagine-bench bench x; imagine-bench bench y", "python -c 'import imagine_bench'"):
         merged = dataclasses.replace(three, environment={"command": command})
         assert all(line.endswith("; about 2 more would decide.") for line in verdict(collect(merged))), "no one command"
@@ -162,7 +186,16 @@ def test_one_seed_hides_no_difference_of_others(many: BenchResult) -> None:
     first = collect(many).compared[0]
     protocol = dataclasses.replace(many.protocol, few_seeds=((first, many.protocol.seeds[0]),))
     runs = tuple(run for run in many.runs if run.agent != first or run.seed == many.protocol.seeds[0])
-    caption = table(bench_page(dataclasses.replace(many, protocol=protocol, runs=runs)), "gains").caption
+    page = bench_page(dataclasses.replace(many, protocol=protocol, runs=runs))
+    caption = table(page, "gains").caption
+    last = many.of(first)[0].checkpoints[-1]
+    low, high = statistics.wilson(last.successes, last.test_episodes)
+    words = f"{last.success_rate:.1%} [{low:.1%}, {high:.1%}]".replace("%", "")
+    assert [row[-1] for row in table(page, "scores").rows if row[0] == first] == [words], "over its tests"
+    of = {row["agent"]: row["interval_over"] for row in csv.DictReader(io.StringIO(page.files["summary.csv"]))}
+    assert of[first] == "episodes" and of["dqn"] == "seeds"
+    (said,) = (line for line in page.answers if line.startswith(f"{first}: "))
+    assert f"undecided with 1 seed of {first} and 7 of dqn" in said
     assert "The smallest difference that would be shown with probability 80 % is " in caption and "nan" not in caption
 
 
@@ -173,6 +206,10 @@ def test_headlines_are_corrected_for_one_another_alone(headed: BenchResult) -> N
     others = [record for record in data.records if "p" in record and record is not headline]
     assert [record["p_holm"] for record in others] == statistics.holm([record["p"] for record in others]).tolist()
     assert data.cells == sum("p" in record for record in data.records) - 1, "all other comparisons with DQN, each once"
+    for pairs, cells in ((PAIRS, data.cells), (PAIRS[1:], data.cells + 1)):
+        protocol = dataclasses.replace(headed.protocol, headlines=pairs)
+        caption = table(bench_page(dataclasses.replace(headed, protocol=protocol)), "gains").caption
+        assert f"for {cells} cells, those of the {len(pairs)} headlines for one another alone" in caption
 
 
 def test_a_difference_is_shown_only_after_holms_correction(many: BenchResult) -> None:
@@ -264,11 +301,3 @@ def test_the_page_can_be_read_alone_and_shows_every_figure(folder: Path) -> None
     assert {"success.png", "open_loop.png", "rollout_imagination_1.png"} <= pictures
     assert len(pictures) == text.count("<img")
     assert all((folder / picture).read_bytes().startswith(b"\x89PNG") for picture in pictures)
-
-
-def test_three_seeds_are_too_few_to_say_whatever_they_solve(result: BenchResult) -> None:
-    page = bench_page(shifted(result, dqn=[100, 102, 104], imagination=[198, 199, 200]))
-    assert table(page, "gains").caption.startswith("Too few seeds to say")
-    rows = list(csv.DictReader(io.StringIO(page.files["summary.csv"])))
-    assert {row["interval_over"] for row in rows} == {"too few seeds"}
-    assert all(row[name] in ("", "nan") for row in rows for name in (*SCORE[1:], *DIFFERENCE[1:], "p_holm"))

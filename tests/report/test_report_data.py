@@ -16,7 +16,7 @@ from guest_packages import Guests
 from imagine_bench import reference, registry, statistics
 from imagine_bench.errors import SetupError, UnknownNameError
 from imagine_bench.protocols.control import Protocol
-from imagine_bench.report.bench import bench_page, cost, gain
+from imagine_bench.report.bench import bench_page, cost, gain, verdict
 from imagine_bench.report.data import (
     DIFFERENCE,
     SCORE,
@@ -51,10 +51,14 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> BenchResult:
 def test_the_card_of_an_encoder_outlives_two_merges(result: BenchResult) -> None:
     """A merged bench keeps the facts of its benches below their numbers, and may be merged again."""
     protocol = dataclasses.replace(result.protocol, encoder="mine@0123456789ab")
-    kept = {"encoders": {"mine@0123456789ab": {"frames": 8_000}}}
+    card = {"frames": 8_000, "probe": {"mlp": 0.115}}
+    kept = {"encoders": {"mine@0123456789ab": card}}
     for facts in (kept, {"bench 1": {}, "bench 2": kept}, {"bench 1": {"bench 1": {}, "bench 2": kept}}):
         merged = dataclasses.replace(result, protocol=protocol, environment=facts)
-        assert card_of(collect(merged), "imagination") == {"frames": 8_000}
+        assert card_of(collect(merged), "imagination") == card
+        warned = [line.split(" sees through ", 1) for line in verdict(collect(merged))[-2:]]
+        assert [agent for agent, _ in warned] == ["“imagination”", "“imagination_uncertainty”"]
+        assert all("encoder mine, from which a probe reads only 11.5%" in words for _, words in warned)
 
 
 @pytest.mark.parametrize("agent", ["random", "imagination"])
@@ -77,14 +81,16 @@ def test_costs_are_means_over_seeds(result: BenchResult, agent: str) -> None:
 def test_frames_seen_beforehand_are_those_of_the_card(result: BenchResult) -> None:
     path, agents = encoders.bundled()["arrow_puzzle-clean"], ("random", "imagination")
     seen = json.loads(path.with_suffix(".json").read_text())["recipe"]["frames"]
+    codes = encoders.identity(encoders.bundled()["arrow_puzzle-clean-codes"])
     offered = {"of_theirs@0123456789ab": {"recipe": {"frames": 7}, "offer": "theirs:Encoder"}}  # trained elsewhere
     unknown = [*offered, "foreign@0123456789ab"]
     for identity, frames in ((encoders.identity(path), seen), *((each, math.nan) for each in unknown)):
-        protocol = dataclasses.replace(result.protocol, agents=agents, encoder=identity)
+        protocol = dataclasses.replace(result.protocol, agents=agents, encoder=identity, codes=codes)
         runs = tuple(run for run in result.runs if run.agent in agents)
         facts = {**result.environment, "encoders": offered}
         data = collect(dataclasses.replace(result, protocol=protocol, runs=runs, environment=facts))
         assert [frames_before(data, agent) for agent in agents] == [0, pytest.approx(frames, nan_ok=True)]
+        assert frames_before(data, "factored:given") == 8_000 != seen, "through an encoder of another kind"
 
 
 def test_gains_are_of_learners_over_dqn(result: BenchResult) -> None:
@@ -184,7 +190,7 @@ def test_an_agent_of_fewer_seeds_is_paired_where_both_have_one(result: BenchResu
     pairs = Counter(zip(*solved, strict=True))
     (record, *_) = [record for record in collect(fewer).records if record["agent"] == agent]
     assert record["alone"] == pairs["1", "0"] > 0
-    assert bench_page(fewer).summary
+    assert f" · 7 seeds ({few} 6), " in bench_page(fewer).summary
 
 
 def test_an_agent_whose_tests_are_not_known_leaves_nothing_to_pair(result: BenchResult) -> None:

@@ -197,8 +197,11 @@ def test_a_person_is_told_the_chance_of_the_starts_of_the_tests(
 ) -> None:
     there = protocol("arrow_puzzle", "smoke", agents=("random",), split="plan_length=2", execution="kinematic")
     write_json(tmp_path / "protocol.json", there.as_dict())
-    monkeypatch.setattr(play, "keyboard_player", lambda: lambda game, **options: None)
-    said = play.keep_playing(like(tmp_path), tmp_path / "runs")
+    cameras: list[str] = []
+    keyboard = lambda game, **options: cameras.append(game.unwrapped.camera_for_people)  # noqa: E731
+    monkeypatch.setattr(play, "keyboard_player", lambda: keyboard)
+    said = play.keep_playing(like(tmp_path), tmp_path / "runs", camera="far")
+    assert cameras == ["far"]
     chance = certificate(there.spec(testing=True)).chance_level
     assert f"chance {chance:.1%}, optimum 100.0%" in said and f"{SPEC.facts().chance_level:.1%}" not in said
 

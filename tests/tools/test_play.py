@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import importlib
 import sys
+import textwrap
 from types import SimpleNamespace
 from unittest import mock
 
@@ -15,7 +16,7 @@ import numpy as np
 import pytest
 from fake_agents import FakeImaginer
 from imagine_bench_motion.control.keyboard import HandGame, keys_to_commands
-from PIL import Image, ImageSequence
+from PIL import Image, ImageDraw, ImageFont, ImageSequence
 from scipy.spatial.transform import Rotation
 
 from imagine_bench import registry
@@ -55,6 +56,13 @@ def panel(column):
     return column[36 : 36 + 192 : 3, 8 : 8 + 192 : 3]
 
 
+def written(words, place, shape, **options):
+    """A white image with words."""
+    image = Image.new("RGB", shape[1::-1], "white")
+    ImageDraw.Draw(image).multiline_text(place, words, "black", ImageFont.load_default(14), **options)
+    return np.array(image)
+
+
 def test_keys_do_what_the_environment_does():
     game, plain = game_of(), game_of().env
     frame, _ = game.reset(seed=99)  # play gives its seed again and again
@@ -71,18 +79,18 @@ def test_keys_do_what_the_environment_does():
 
 
 def test_the_model_imagines_from_the_first_frame_by_the_same_keys():
-    asked = []
+    asked, told = [], []
 
     class Imaginer(FakeImaginer):
         def imagine(self, frame, *, actions, depth, rng):
             asked.append((actions.tolist(), frame.tobytes(), rng.random()))
             rollout = super().imagine(frame, actions=actions, depth=depth, rng=rng)
             right = registry.task("arrow_puzzle").rules.outcomes(START, 4)[0].macrostate
-            return dataclasses.replace(rollout, macrostates=np.array([right] * depth))  # of the first, not the second
+            told.append(dataclasses.replace(rollout, macrostates=np.array([right] * depth)))  # of the first alone
+            return told[-1]
 
     game = game_of(Imaginer(), execution="kinematic")
     frame, _ = game.reset(options={"macrostate": START})
-    blank = game.render()[:, -284:]
     for _ in range(2):
         seen, _ = until_done(game, 4)
     same_draws = (frame.tobytes(), asked[0][2])
@@ -90,7 +98,11 @@ def test_the_model_imagines_from_the_first_frame_by_the_same_keys():
     sees, imagines = game.render()[:, -568:-284], game.render()[:, -284:]
     np.testing.assert_allclose(panel(imagines)[..., 0], 0.9 * frame.mean(axis=2), atol=1)
     np.testing.assert_array_equal(panel(sees), seen[-1][0])
-    assert not np.array_equal(imagines[240:], blank[240:]), "words about its predictions"
+    last = {name: getattr(told[1], name)[-1] for name in ("rewards", "p_terminated", "epistemic", "aleatoric", "modal")}
+    kinds = "".join(f"    {name} {value:.3g}\n" for name, value in list(last.items())[2:])
+    words = f"reward {last['rewards']:+.1f}, end {last['p_terminated']:.0%}\n\nuncertainty\n{kinds}"
+    words += "would be learned from\n\nforeseen 1 of 2"
+    np.testing.assert_array_equal(imagines[232:], written(words, (8, 236), imagines.shape)[232:])
     assert game.summary().endswith("\nThe model foresaw 1 of 2 macrostates.")
     frame, _ = game.reset()
     until_done(game, 4)
@@ -208,6 +220,13 @@ def test_only_a_success_counts_as_solved(hand):
         game.reset(options={"macrostate": (3, 1, 2, 0)})
         until_done(game, action)
     assert game.summary().startswith("Solved 1 of 3 episodes (33.3%, 95 % interval 6.1% to 79.2%); chance 4.6%")
+    goal = textwrap.wrap(f"Goal: {registry.task('arrow_puzzle').description}", 128)
+    for left in (9, 10):  # after the last one's macro-action, and in the next one
+        more = f"Moves left: {left} of 10. Solved: 1 of 3. "
+        more = f"In the frame, up is toward the human and down toward the robot. {more}"
+        band = game.render()[480:]
+        np.testing.assert_array_equal(band, written("\n".join([*goal, more]), (8, 4), band.shape, spacing=2))
+        game.reset()
     game.close()
     scene = hand.env.unwrapped
     row = scene.world.object_qpos[0]
@@ -250,9 +269,10 @@ def test_a_model_brings_its_task_and_its_appearance(keyboard, monkeypatch, tmp_p
     keyboard("1")
     assert "The model foresaw 0 of 1 macrostates." in play(None, model=tmp_path)
     keyboard("1")
-    play(None, model=tmp_path, execution="physics", appearance="strong")
-    made = [[call.kwargs[name] for name in ("execution", "appearance")] for call in make.call_args_list]
-    assert made == [["kinematic", "mild"], ["physics", "strong"]], "options are above the model's"
+    play(None, model=tmp_path, execution="physics", appearance="strong", camera="far")
+    chosen = ("execution", "appearance", "camera")
+    made = [[call.kwargs.get(name, "human") for name in chosen] for call in make.call_args_list]
+    assert made == [["kinematic", "mild", "human"], ["physics", "strong", "far"]], "options are above the model's"
     monkeypatch.setattr(trained, "task", registry.task("arrows:cubes=1,slip=0.1"))
     keyboard("1")
     assert "1 macrostates" in play("arrows:slip=0.10,cubes=1", model=tmp_path), "written in another way"
@@ -329,13 +349,16 @@ def test_continuous_control_is_told_which_options_it_does_not_take(option, capsy
 
 def test_a_film_lasts_as_long_as_its_motions_and_is_never_overwritten(tmp_path):
     """At ten images a second; 0.8 s before and after each macro-action, and 5 s more at the goal."""
-    out = film("arrow_puzzle_easy", tmp_path / "new" / "turn.gif", seed=1)
+    seen = {"appearance": "strong", "camera": "far"}
+    out = film("arrow_puzzle_easy", tmp_path / "new" / "turn.gif", seed=1, **seen)
     with Image.open(out) as gif:
+        first = np.float32(gif.convert("RGB"))[:480, :640]
         shown = [(np.float32(each.convert("L")), each.info["duration"]) for each in ImageSequence.Iterator(gif)]
     pictures = np.stack([picture for picture, _ in shown])
     images, over = 8 + 50 - 1, False
-    with contextlib.closing(gymnasium.make("imagine_bench/ArrowPuzzleEasy-v0", motion_hz=10.0)) as env:
+    with contextlib.closing(gymnasium.make("imagine_bench/ArrowPuzzleEasy-v0", motion_hz=10.0, **seen)) as env:
         _, info = env.reset(seed=episode_seed("recording", 1, 0))
+        assert np.abs(first - env.unwrapped.human_view(640, 480)).mean() < 8, "but for the colors of a GIF"
         while not over:
             action = registry.task("arrow_puzzle_easy").rules.optimal_action(info["macrostate"])
             *_, over, _, info = env.step(action)

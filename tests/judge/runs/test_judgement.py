@@ -36,6 +36,7 @@ from imagine_bench.judge import judgement
 from imagine_bench.judge.judgement import Judgement, ModelFit, judge, kept, shown
 from imagine_bench.judge.scores import FORMER
 from imagine_bench.judge.truth import shares
+from imagine_bench.recording.filmstrips import Tile, png, sheet
 from imagine_bench.report.judge import COLUMNS, Judged, in_short, judged, judgement_page
 from imagine_bench.report.page import DASH
 from imagine_bench.rules import outcomes_by_depth
@@ -304,6 +305,21 @@ def test_kept_images_show_their_questions_and_the_likeliest_outcomes(said: Said)
                 assert any(np.array_equal(real[step], frame) for frame in most)
                 assert bool(right[step]) == (world.index.shows(imagined[step]) in likely)
                 assert model == "exact" or np.array_equal(imagined[step], before)
+    page = judgement_page(judged(said.folder, _of("copy", "exact")))
+    drawn = {image.name: image.png for section in page.sections for image in section.images}
+    words = {True: "as the rules say", False: "not as the rules say"}
+    titles = {"copy": "copy the last frame", "exact": "exact (privileged)"}
+    for image, kind, models in (("futures", "futures", titles), ("worst_copy", "worst", ["copy"])):
+        actions, befores, reals = (found["copy"][f"{kind}_{part}"] for part in ("actions", "before", "real"))
+        names = [world.spec.action_names[action] for action in np.ravel(actions)]
+        real = [frame for course in reals for frame in course]  # several of one rollout, or one of each transition
+        before = [befores[0], *real[:-1]] if kind == "futures" else befores
+        rows = [("before", [*map(Tile, before, names)]), ("real", [*map(Tile, real)])]
+        for model in models:
+            frames = [frame for course in found[model][f"{kind}_imagined"] for frame in course]
+            both = zip(frames, np.ravel(found[model][f"{kind}_right"]).tolist(), strict=True)
+            rows.append((titles[model], [Tile(frame, "", words[right], right) for frame, right in both]))
+        assert drawn[image] == png(sheet(rows)), image
 
 
 def test_a_model_whose_code_has_changed_is_judged_anew(copied: Path) -> None:
@@ -341,15 +357,16 @@ def test_a_model_of_theirs_is_judged(said: Said) -> None:
     one = shown(said.folder, _of("exact"))["exact"]
 
     def logged_by_depth(entity: str, column: str) -> list[Any]:
-        """But for the start."""
-        return [value for _, (value,) in logged(recorded, entity, column, "depth")][1:]
+        return [value for _, (value,) in logged(recorded, entity, column, "depth")]
 
-    actions = logged_by_depth("/action", "TextDocument:text")
+    begun, *actions = logged_by_depth("/action", "TextDocument:text")
+    assert begun == "the start"
     assert actions == [f"**{depth}. {names[action]}**" for depth, action in enumerate(one["futures_actions"][0], 1)]
     for name, of in (("real", "real"), ("exact", "imagined")):
         frames = logged_by_depth(f"/{name}/frame", "Image:buffer")
-        assert np.array_equal(np.ravel(frames), np.ravel(one[f"futures_{of}"][0]))
-        for text, shares in zip(logged_by_depth(f"/{name}/outcomes", "TextDocument:text"), one["futures"][of], strict=True):
+        assert np.array_equal(np.ravel(frames), np.ravel([one["futures_before"][0], *one[f"futures_{of}"][0]]))
+        texts = logged_by_depth(f"/{name}/outcomes", "TextDocument:text")
+        for text, shares in zip(texts, [{}, *one["futures"][of]], strict=True):
             assert text == "\n".join(f"- {shares[each]:.0%} {each}" for each in sorted(shares, key=shares.get, reverse=True))
     scored = _cells(said, "copy", "exact")
     exact = scored["exact", 60]

@@ -119,7 +119,9 @@ def test_each_format_gives_the_episodes_back(tmp_path: Path, format: str) -> Non
 def test_lerobot_rows_have_cameras_state_and_task(tmp_path: Path) -> None:
     said = episode()["instruction"].copy()
     said[40:] = "Stop."
-    written(tmp_path / "set", "lerobot", count=2, instruction=said.astype("<U40"))
+    late = episode()["terminated"]
+    changes = {"instruction": said.astype("<U40"), "truncated": late, "terminated": np.zeros_like(late)}
+    written(tmp_path / "set", "lerobot", count=2, **changes)
     lengths = [len(episode(index=index)["rewards"]) for index in range(2)]
     count = np.concatenate(list(map(np.arange, lengths)))
     info = json.loads((tmp_path / "set/meta/info.json").read_text())
@@ -130,6 +132,7 @@ def test_lerobot_rows_have_cameras_state_and_task(tmp_path: Path) -> None:
     shapes = {**images, "action": [7], "observation.state": [16]}
     assert {name: info["features"][name]["shape"] for name in shapes} == shapes
     numbers = {"index": np.arange(len(count)), "frame_index": count, "episode_index": np.repeat([0, 1], lengths)}
+    numbers["next.done"] = np.diff(numbers["episode_index"], append=2) > 0
     numbers["task_index"] = (numbers["index"] >= 40) & (numbers["index"] < lengths[0])
     for name, column in numbers.items():
         np.testing.assert_array_equal(table[name].to_numpy(), column, err_msg=name)
@@ -148,6 +151,23 @@ def test_lerobot_rows_have_cameras_state_and_task(tmp_path: Path) -> None:
         for which in ("min", "max", "mean", "std"):
             np.testing.assert_allclose(np.ravel(stats[told][which]), getattr(of, which)(axis=0), atol=1e-6)
         assert stats[told]["count"] == [sum(lengths)]
+
+
+def test_demonstrations_in_several_files_with_tasks_in_any_order_are_read(tmp_path: Path) -> None:
+    """As tools of LeRobot may leave them."""
+    said = episode()["instruction"].astype("<U40")
+    said[40:] = "Stop."
+    written(tmp_path / "set", "lerobot", count=2, instruction=said)
+    before = [content_hash(each) for each in read_demonstrations(tmp_path / "set")]
+    data, tasks = tmp_path / "set/data/chunk-000", tmp_path / "set/meta/tasks.parquet"
+    table = pq.read_table(data / "file-000.parquet")
+    for index in range(2):
+        of_one = np.flatnonzero(table["episode_index"].to_numpy() == index)
+        pq.write_table(table.take(of_one), data / f"file-{index:03}.parquet")
+    pq.write_table(pq.read_table(tasks).take([1, 0]), tasks)
+    found = list(read_demonstrations(tmp_path / "set"))
+    assert [content_hash(each) for each in found] == before
+    assert [each["instruction"].tolist() for each in found] == [said.tolist(), episode(index=1)["instruction"].tolist()]
 
 
 def test_minari_recovers_the_environment_of_demonstrations(tmp_path: Path) -> None:

@@ -112,6 +112,8 @@ def play_all(one: Server, player: str) -> None:
             moves += 1
             assert answer["metadata"]["step_count"] == moves, "also after the last macro-action of the last test"
         all_done = answer["metadata"]["all_done"]
+        then = " Now all 3 episodes are played. " if all_done else " Reset begins the next one. "
+        assert then in answer["observation"]["words"]
 
 
 def played_bench(root: Path, player: str) -> Path:
@@ -338,6 +340,7 @@ def test_few_players_and_few_connections_are_let_in(tmp_path: Path, monkeypatch:
         assert ask(one, "/reset", {"player": "ann"})[0] == 200
         status, said = ask(one, "/reset", {"player": "bo"})
         assert status == 400 and "1 players are here already" in said["error"]
+        assert ask(one, "/reset", {"player": "ann"})[0] == 200, "who is in stays"
         silent = [silent_connection(one) for _ in range(2)]
         with pytest.raises((http.client.HTTPException, OSError)):
             ask(one, "/health")
@@ -393,6 +396,10 @@ def test_it_binds_to_this_machine_alone_and_says_where_it_cannot(
         Server(players, "127.0.0.1", 70_000)
     with Server(players, "0.0.0.0", 0) as reachable:
         announce(reachable)
+        threading.Thread(target=reachable.serve_forever).start()
+        for origin, status in (("here", 200), ("elsewhere", 403)):
+            assert ask(reachable, "/health", Host="here", Origin=f"http://{origin}")[0] == status
+        reachable.shutdown()
     assert "There is no key: whoever reaches this machine can play" in capsys.readouterr().out
     players.close()
     with pytest.raises(ImagineBenchError, match="players"):
