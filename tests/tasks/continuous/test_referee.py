@@ -266,6 +266,20 @@ def test_an_event_is_a_macro_action_or_says_what_else_it_is(
     assert event.outcome.macrostate == START
 
 
+def test_a_grip_is_over_when_the_fingers_are_told_to_open_and_touch_nothing() -> None:
+    """By 3 mm more than they were ever told to close; the next grip slips or not by itself."""
+    env = make_pick_place(observation="proprio", slip=0.99)
+    env.referee = referee = ToldReferee(env.world, env.task.rules, env.task.macrostate_values)
+    env.reset(seed=0, options={"macrostate": (0, 0, 0, BALL)})
+    grips = []
+    for told, grip in ((0, 0), (3, -1), (0, -1), (3, -0.5), (0, -0.9), (0, -0.8), (1, -1), (3, -1)):
+        referee.told = (told, 0, 0)
+        env.step(np.array([0.0] * 6 + [grip]))
+        grips.append(env.episode.gripped_m is not None)
+        assert env.episode.slipping == grips[-1]
+    assert grips == [False, True, True, True, True, False, False, True]
+
+
 def test_people_answer_an_event_as_often_as_the_rules_say() -> None:
     """Half of them want the same as before, and a quarter each of the two other cubes."""
     env = arrows(goal="000", forbid="none", goal_change=0.5)
