@@ -199,6 +199,23 @@ def test_a_cube_that_is_turned_the_other_way_is_judged_by_where_it_is():
     assert (reward, terminated, info["legal"], info["success"]) == (-1.0, False, True, False)
 
 
+def test_rewards_follow_what_was_read_where_a_cube_does_not_turn():
+    """No weld, no teleport: fingers that touch nothing leave the cube as it is, and the robot feels it holds none."""
+    env = make().unwrapped
+    model = env.world.model
+    arm = np.flatnonzero((model.geom_group == ARM_GROUP) | (model.geom_contype == 2))
+    model.geom_contype[arm] = model.geom_conaffinity[arm] = 0
+    env.reset(seed=0, options={"macrostate": (3, 1, 2, 0)})
+    before = env.world.object_poses()
+    _, reward, terminated, _, info = env.step(0)  # a good turn would reach the goal
+    np.testing.assert_allclose(env.world.object_poses(), before, atol=1e-3)
+    env.close()
+    assert info["fault"] and info["fault_reason"] == "the fingers closed past cube 0"
+    assert info["macrostate"].tolist() == [3, 1, 2, 0]
+    assert not info["success"]
+    assert (reward, terminated) == (-1.0, False)
+
+
 @pytest.mark.parametrize("shift_m", [0.0, 0.004, 0.006])
 @pytest.mark.parametrize(
     ("task", "start", "motion", "pushed", "words"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import statistics
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -84,6 +85,23 @@ def test_untried_pairs_show_nothing_unless_sampled() -> None:
     assert certificate(spec, measure).shown == pytest.approx((0 + 1 + 1) / 3, abs=1e-6)
 
 
+@pytest.mark.parametrize(("ending", "whole"), [(2, [1, 2, 3, 4]), (6, [1, 2, 3, 4, 5, 6])])
+def test_mean_seconds_are_those_of_segments_that_go_on_if_there_are_any(ending: int, whole: list[float]) -> None:
+    """The longest ones count all, since an episode may end with any."""
+    spec = registry.task("arrow_puzzle_easy")
+    measure = measurement(spec)
+    for number, segment in enumerate(measure["segments"], 1):
+        segment[4:] = [number, number + 0.5, number > 6 - ending]
+        measure["least_s"][number - 1] = 0.1 * number
+    found = certificate(spec, measure)
+    mean_s = statistics.mean(whole)
+    spread_s = 1.96 * statistics.pstdev(whole) / len(whole) ** 0.5
+    assert [found.mean_low_s, found.mean_s, found.mean_high_s, found.least_s] == pytest.approx(
+        [mean_s - spread_s, mean_s, mean_s + spread_s, 0.1 * mean_s]
+    )
+    assert (found.longest_s, found.macro_actions) == (6.5, 3)
+
+
 @pytest.mark.parametrize("task", MEASURED)
 @pytest.mark.parametrize("appearance", ["clean", "strong"])
 def test_what_was_measured_leaves_less_than_a_point(task: str, appearance: str) -> None:
@@ -125,9 +143,11 @@ def test_what_was_measured_is_of_the_task_as_it_is(task: str) -> None:
 def test_the_command_measures_and_keeps_a_certificate(name: str, tmp_path: Any, capsys: Any) -> None:
     out = tmp_path / "kept.json"
     words = ["check", name, "--physics", "--trials", "2", "--turns", "2", "--random", "1", "--out", str(out)]
+    words += ["--appearances", "clean", "strong"]
     assert main(words) == 0
     kept = json.loads(out.read_text())
     found = certificate(registry.task(kept["task"]), kept["appearances"]["clean"])
+    assert kept["appearances"]["strong"]["segments"] != kept["appearances"]["clean"]["segments"]
     assert found.as_ruled == found.segments >= 2
     assert found.solved == found.episodes >= 1
     assert kept["environment"]["commit"]

@@ -1,6 +1,7 @@
 """The physics of grasping: settings, their margins, blind moves, and collisions of the arm."""
 
 import copy
+import re
 
 import gymnasium
 import mujoco
@@ -168,6 +169,24 @@ def test_the_arm_does_touch_what_is_in_its_way():
         found = touching(env.model, mujoco.MjData(env.model), qpos, names)
         assert {name for pair in found for name in pair} >= ({*expected, "table_top"} if expected else set())
         assert bool(found) == bool(expected)
+
+
+ARM = r"l[456]_.*|hand_(mount|rail)|finger_(left|right)_back"
+TIPS = "finger_.*_tip_.*"
+THINGS = r"table_top|cube_._box|ball_skin|car_(box|wheel_.)|cup_(wall|foot_.)|palm_(plate|rim_.)"
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_arm_and_hand_touch_each_thing_and_not_each_other(task):
+    """Fingertips touch each other too. No pointing hand touches anything, nor does what is only drawn."""
+    scene = COMPILE[task](distractors=2, control=True)
+    names = [scene.geom(index).name for index in range(scene.ngeom)]
+    arm, tips, things = ([bool(re.fullmatch(parts, name)) for name in names] for parts in (ARM, TIPS, THINGS))
+    assert (sum(arm), sum(tips)) == (10, 4)
+    grips = np.logical_or(tips, things)
+    touch = scene.geom_contype[:, None] & scene.geom_conaffinity > 0
+    expected = np.outer(grips, grips) | np.outer(arm, things)
+    np.testing.assert_array_equal(touch | touch.T, expected | expected.T)
 
 
 def deepest_in_hand_m(level, actions):

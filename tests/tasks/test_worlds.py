@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import mujoco
 import numpy as np
 import pytest
@@ -42,9 +44,9 @@ def test_macrostates_are_read_back_at_every_level(name, level):
 DISPLACED = {"x m": (0.014, 0.016, 0.018, 0.021), "z m": (0.005, 0.05), "yaw": (19, 21, 25, 90), "tilt": (8, 12, 90)}
 
 
-def read_displaced(world, index, how, amount):
+def read_displaced(world, index, how, amount, start=(0, 0, 0, 0)):
     """What is read where an object is moved, or turned by degrees, off its place."""
-    world.place((0, 0, 0, 0), np.random.default_rng(0))
+    world.place(start, np.random.default_rng(0))
     row = world.object_qpos[index]
     if how.endswith("m"):
         world.data.qpos[row["xyz".index(how[0])]] += amount
@@ -72,16 +74,19 @@ IN_PALM = ((0, 0.036), (1, 0.036), (2, 0.006))
 
 @pytest.mark.parametrize("index", range(len(OBJECTS)))
 def test_an_object_is_held_or_handed_over_near_the_middle_alone(index):
-    """15 mm off the gripper's; 36 mm off the palm's, and 6 mm off its height there."""
-    world = world_of("pick_place", FIXED)
-    row = world.object_qpos[index]
+    """15 mm off the gripper's; 36 mm off the palm's, and 6 mm off its height there. In a palm it stands upright."""
+    world, upright = world_of("pick_place", FIXED), OBJECTS[index].upright
+    starts = {value: (*(value * (each == index) for each in range(3)), OPEN_PALM) for value in (PICKED, HANDED_OVER)}
     for value, axis, most_m in ((PICKED, 0, 0.015), (PICKED, 2, 0.015), *((HANDED_OVER, *each) for each in IN_PALM)):
         for off_m in (-most_m - 0.001, -most_m + 0.001, most_m - 0.001, most_m + 0.001):
-            world.place((*(value * (each == index) for each in range(3)), OPEN_PALM), np.random.default_rng(0))
-            world.data.qpos[row[axis]] += off_m
-            reading = world.read()
+            reading = read_displaced(world, index, "xyz"[axis] + " m", off_m, starts[value])
             assert reading.macrostate[index] == (value if abs(off_m) < most_m else PLACED), (value, axis, off_m)
             assert (reading.problem is None) == (abs(off_m) < most_m)
+    for value, how, amount in itertools.product(starts, ("tilt", "yaw"), (8, 12, 25)):
+        reading = read_displaced(world, index, how, amount, starts[value])
+        tipped = value == HANDED_OVER and how == "tilt" and amount > 10 and upright
+        assert reading.macrostate == starts[value]
+        assert reading.problem == (f"the {OBJECTS[index].name} is tipped by {amount} degrees" if tipped else None)
 
 
 @pytest.mark.parametrize("name", NAMES)

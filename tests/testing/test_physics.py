@@ -11,6 +11,8 @@ import pytest
 
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
+from imagine_bench.interfaces import PhysicsSettings
+from imagine_bench.seeding import episode_seed
 from imagine_bench.testing import physics
 from imagine_bench.testing.physics import (
     Fidelity,
@@ -27,7 +29,7 @@ def test_fidelity_and_margins_are_measured_and_kept(tmp_path, monkeypatch, capsy
     monkeypatch.setattr(physics, "_WALK_ACTIONS", 3)
     out = tmp_path / "deep" / "margins.json"
     words = ["check", "--physics", "pick_place", "--turns", "4", "--trials", "4", "--out", str(out)]
-    assert main(words) == 0
+    assert main([*words, "--appearances", "clean", "mild"]) == 0
     kept = json.loads(out.read_text())
     first, last = kept["curves"]["pad_friction"]
     assert (first["value"], first["as_ruled"], first["trials"], first["high"]) == (1.2, 4, 4, 1.0)
@@ -36,6 +38,8 @@ def test_fidelity_and_margins_are_measured_and_kept(tmp_path, monkeypatch, capsy
     assert walks == [("true", 6, [3, 3]), ("nominal", 6, [3, 3])]
     assert kept["built"]["pad_friction"] == 1.2 and kept["environment"]["commit"]
     assert kept["figures"][0]["required"] == ">= 99.5%" and kept["figures"][0]["met"]
+    worlds = [each["what"].partition(": ")[0] for each in kept["figures"]]
+    assert list(dict.fromkeys(worlds)) == ["pick_place", "pick_place at mild"]
     assert "| pad_friction | 0.01 | 0 of 4 | 0.000 to " in capsys.readouterr().out
 
 
@@ -57,7 +61,7 @@ class Scripted(gymnasium.Env):
 
     def __init__(self, execution="physics", appearance="clean", physics=None):
         self.real = execution == "physics"
-        self.count = 0
+        self.count = 2 * (physics == PhysicsSettings(sense="nominal"))
         self.world = self
 
     def reset(self, *, seed, options=None):
@@ -76,7 +80,7 @@ class Scripted(gymnasium.Env):
             self.poses[[cube, 1 - cube], :3] += 1e-3 * np.array([mine_mm, others_mm])
             self.poses[cube, [3, 6]] = np.cos(np.radians(turned_deg) / 2), np.sin(np.radians(turned_deg) / 2)
         fault = self.real and what == "dropped"
-        return None, 0.0, False, False, {"macrostate": np.array(self.state), "fault": fault, "fault_reason": what}
+        return None, 0.0, True, False, {"macrostate": np.array(self.state), "fault": fault, "fault_reason": what}
 
     def object_poses(self):
         return self.poses.copy()
@@ -115,6 +119,17 @@ def test_figures_of_fidelity_have_their_units_and_targets():
     assert (figure.required, figure.measured, figure.met) == ("–", "66.67%", True)
 
 
+@pytest.mark.parametrize(
+    ("level", "goes_on", "begun"), [("clean", True, [0, 3]), ("mild", True, [0, 3, 5, 10]), ("mild", False, range(12))]
+)
+def test_a_walk_beside_the_rules_begins_anew_after_a_fault_and_where_it_must(level, goes_on, begun):
+    """Where poses vary, every fifth macro-action; and at each end of an episode unless the task goes on."""
+    spec = two_cubes(0)
+    SEEDS.clear()
+    measure_fidelity(replace(spec, targets=replace(spec.targets, goes_on=goes_on)), 12, level)
+    assert set(SEEDS) == {episode_seed("tuning", 0, step) for step in (12, *begun)}
+
+
 def test_a_walk_ends_with_its_first_fault_and_drifts_as_far_as_a_standing_object():
     """Each walk and each trial has a start of its own."""
     SEEDS.clear()
@@ -124,12 +139,13 @@ def test_a_walk_ends_with_its_first_fault_and_drifts_as_far_as_a_standing_object
         "sense": "true", "actions": 803, "as_ruled": 802, "lengths": [3, 200, 200, 200, 200], "faults": ["dropped"],
     }  # fmt: skip
     assert len(set(SEEDS)) == len(SEEDS) == 5
-    assert physics.as_ruled(two_cubes(0), physics.PhysicsSettings(), 5) == 4 and len(set(SEEDS)) == 10
+    assert physics.as_ruled(two_cubes(0), PhysicsSettings(), 5) == 4 and len(set(SEEDS)) == 10
+    assert physics.walk(two_cubes(0), "nominal")["lengths"][0] == 1
 
 
 @pytest.mark.parametrize("name", physics.SWEEPS)
 def test_every_sweep_begins_as_the_scene_is_built(name):
-    assert physics.SWEEPS[name][0] == getattr(physics.PhysicsSettings(), name)
+    assert physics.SWEEPS[name][0] == getattr(PhysicsSettings(), name)
 
 
 @pytest.mark.parametrize("world", ["arrows:slip=0.3", "pick_place:slip=0.5"])

@@ -11,6 +11,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from imagine_bench.tasks.continuous.controls import WORKSPACE_HIGH_M, WORKSPACE_LOW_M
 from imagine_bench.tasks.continuous.spec import make_arrows, make_pick_place
+from imagine_bench.tasks.scenes.constants import OBSERVATION_QPOS_RAD
 
 IDS = sorted(each for each in gymnasium.registry if re.fullmatch(r"imagine_bench/\w+Motion-v0", each))
 
@@ -41,6 +42,8 @@ def test_videos_have_as_many_images_a_second_as_commands(rate_hz: float, images:
     [
         ("twist", [0.0] * 7, 5, ""),
         ("joint_delta", [*[0.5] * 7, 1], 2, ""),
+        ("joint", [*OBSERVATION_QPOS_RAD, 1], 5, ""),
+        ("pose", [0.62, 0, 0.2, 0, 1, 0, 0, 1], 5, ""),
         *(("twist", [*side, 0, 0, 0, 1], 28, "workspace") for side in 0.5 * np.array([*np.eye(3)[1:], *-np.eye(3)])),
         ("twist", [0, 0, 0, 1, 0, 0, 1], 25, "reach"),  # the hand tips over until a joint is at the end of its range
         ("pose", [0.90, 0.45, 0.45, 0, 1, 0, 0, 1], 60, "reach"),  # too far for a hand that points down there

@@ -7,6 +7,7 @@ import math
 from typing import Any
 from unittest import mock
 
+import gymnasium
 import numpy as np
 import pytest
 from by_hand import FAMILIES, FREE, STARTS, carry_out, environment
@@ -21,6 +22,7 @@ from imagine_bench.tasks.motion.orientation import about_vertical
 from imagine_bench.tasks.scenes.arm import JOINT_SPEED_LIMITS_RAD_S
 
 from imagine_bench.arrays import Floats
+from imagine_bench.rules import shortest_plans, tabulate
 
 
 @pytest.mark.parametrize("control", CONTROL_NAMES)
@@ -167,8 +169,9 @@ def test_a_segment_begins_with_the_hand_moved_and_turned(signs: tuple[int, ...])
 
 @pytest.mark.parametrize(("cubes", "rate_hz"), [(1, 12.5), (2, 62.5), (3, 15.625), (4, 25), (5, 125), (6, 25)])
 def test_any_number_of_cubes_is_turned_by_hand(cubes: int, rate_hz: float) -> None:
-    """With any number of commands a second."""
-    env, expert = environment("arrows", cubes=cubes, goal="0" * cubes, forbid="none", rate_hz=rate_hz)
+    """With any number of commands a second, of each kind."""
+    world = {"cubes": cubes, "goal": "0" * cubes, "forbid": "none"}
+    env, expert = environment("arrows", rate_hz=rate_hz, control=[*CONTROL_NAMES][(cubes + 1) % 4], **world)
     env.reset(seed=0, options={"macrostate": (*(1, 2, 3, 1, 2, 3)[:cubes], 0)})
     for action in (1, 2 * cubes - 2):
         assert [each["macro_action"] for each in carry_out(env, expert, action)] == [action]
@@ -328,9 +331,16 @@ def test_a_grip_that_slips_never_has_more_friction_than_one_that_holds(pad_frict
 
 
 def test_a_measured_segment_lasts_as_long_as_its_macro_action() -> None:
-    """The first try begins where the arm rests, and each later one with the hand moved aside."""
+    """The first try begins where the arm rests, and each later one with the hand moved aside.
+
+    Whole episodes have the seeds 0, 1, 2 and so on, and together at least as many macro-actions as were asked for.
+    """
     env, expert = environment("arrows", cubes=1)
-    found = measure(env, tries=18, turns=0)
+    found = measure(env, tries=18, turns=9)
+    tables = tabulate(env.task.rules)
+    starts = [tables.index[tuple(env.reset(seed=seed)[1]["macrostate"].tolist())] for seed in range(9)]
+    done = np.cumsum(shortest_plans(tables)[starts])
+    assert found.solved == found.episodes == 1 + np.searchsorted(done, 9) != 1 + np.ceil(9 / done[0])
     sampled = measure(env, tries=4, turns=0)
     assert [(each.pairs, [tries for _, _, tries, *_ in each.segments]) for each in (found, sampled)] == [
         (6, [3] * 6),
@@ -348,6 +358,25 @@ def test_a_measured_segment_lasts_as_long_as_its_macro_action() -> None:
             lasted_s.append(env.data.time - began_s)
         assert (mean_s, longest_s) == pytest.approx((np.mean(lasted_s), max(lasted_s)), abs=1e-3)
         assert ends == env.task.rules.outcomes((*objects, 0), action)[0].terminated
+
+
+def test_lanes_see_as_late_as_each_would_alone() -> None:
+    """One has two events, the other none."""
+    options = {"observation": "proprio,state", "lag": 1, **FREE["arrows"]}
+    lanes = gymnasium.make_vec("imagine_bench/ArrowsMotion-vector-v0", num_envs=2, **options)
+    alone = [FAMILIES["arrows"](**options) for _ in range(2)]
+    for seed, env in enumerate((lanes, *alone)):
+        env.reset(seed=max(0, seed - 1), options={"macrostate": STARTS["arrows"]})
+    expert = Expert(alone[1])
+    for action in (0, 2):
+        expert.begin(action)
+        while not expert.is_done:
+            actions = np.stack([np.zeros(7, dtype=np.float32), expert.act()])
+            seen, *_ = lanes.step(actions)
+            own = [env.step(each)[0] for env, each in zip(alone, actions, strict=True)]
+            for name, parts in seen.items():
+                np.testing.assert_array_equal(parts, [each[name] for each in own])
+    assert [env.episode.events for env in alone] == [0, 2]
 
 
 def hand(env: MotionEnv) -> tuple[Floats, Floats]:

@@ -266,6 +266,20 @@ def test_an_event_is_a_macro_action_or_says_what_else_it_is(
     assert event.outcome.macrostate == START
 
 
+def test_a_grip_is_over_when_the_fingers_are_told_to_open_and_touch_nothing() -> None:
+    """By 3 mm more than they were ever told to close; the next grip slips or not by itself."""
+    env = make_pick_place(observation="proprio", slip=0.99)
+    env.referee = referee = ToldReferee(env.world, env.task.rules, env.task.macrostate_values)
+    env.reset(seed=0, options={"macrostate": (0, 0, 0, BALL)})
+    grips = []
+    for told, grip in ((0, 0), (3, -1), (0, -1), (3, -0.5), (0, -0.9), (0, -0.8), (1, -1), (3, -1)):
+        referee.told = (told, 0, 0)
+        env.step(np.array([0.0] * 6 + [grip]))
+        grips.append(env.episode.gripped_m is not None)
+        assert env.episode.slipping == grips[-1]
+    assert grips == [False, True, True, True, True, False, False, True]
+
+
 def test_people_answer_an_event_as_often_as_the_rules_say() -> None:
     """Half of them want the same as before, and a quarter each of the two other cubes."""
     env = arrows(goal="000", forbid="none", goal_change=0.5)
@@ -276,8 +290,10 @@ def test_people_answer_an_event_as_often_as_the_rules_say() -> None:
     assert np.bincount(wishes) == pytest.approx([200, 100, 100], abs=30)
 
 
+@pytest.mark.parametrize("sense", [-1, 1])
+@pytest.mark.parametrize("before", range(4))
 @pytest.mark.parametrize(
-    ("off_m", "turned_rad", "axis", "value"),
+    ("off_m", "turned_rad", "axis", "quarters"),
     [
         ((0.0, 0.0, 0.0), 2.0, 2, 1),  # turned by 115 degrees on its place
         ((0.0, 0.0, 0.0), 1.8, 2, 0),  # by 103
@@ -287,14 +303,30 @@ def test_people_answer_an_event_as_often_as_the_rules_say() -> None:
     ],
 )
 def test_a_quarter_is_passed_only_upright_on_the_slot(
-    off_m: tuple[float, ...], turned_rad: float, axis: int, value: int
+    off_m: tuple[float, ...], turned_rad: float, axis: int, quarters: int, before: int, sense: int
 ) -> None:
-    quat = [math.cos(turned_rad / 2), 0.0, 0.0, 0.0]
-    quat[1 + axis] = -math.sin(turned_rad / 2)
+    """From any direction, to either side."""
+    angle_rad = sense * turned_rad + before * math.pi / 2 * (axis == 2)
+    quat = [math.cos(angle_rad / 2), 0.0, 0.0, 0.0]
+    quat[1 + axis] = -math.sin(angle_rad / 2)
     world = free().world
     x_m, y_m = world.layout.slots_xy_m[0]
     place_m = np.array([x_m, y_m, TABLE_HEIGHT_M + STANDING_M]) + off_m
-    assert world.value_in_hand(0, [*place_m, *quat], 0, gripped=True) == value
+    assert world.value_in_hand(0, [*place_m, *quat], before, gripped=True) == (before + sense * quarters) % 4
+
+
+@pytest.mark.parametrize("touched", range(1, 8))
+def test_an_object_is_gripped_by_both_fingers_whatever_else_touches_it(touched: int) -> None:
+    """Bits 1 and 2 are the fingers, 4 the rest of the arm. A lifted object that is gripped is picked; a grip slips."""
+    env = make_pick_place(observation="proprio", slip=0.99)
+    env.referee = referee = ToldReferee(env.world, env.task.rules, env.task.macrostate_values)
+    env.reset(seed=0, options={"macrostate": (0, 0, 0, BALL)})
+    for referee.told in ((0, 0, 0), (touched, 0, 0)):
+        env.step(np.zeros(7))
+    assert env.episode.slipping == (touched in (3, 7))
+    env.data.qpos[env.world.object_qpos[BALL, 2]] += 0.06
+    event = referee.event((0, 0, 0, BALL), np.random.default_rng(0))
+    assert (event.action if event else None) == (BALL if touched in (3, 7) else None)
 
 
 class AnyChange(ArrowRules):

@@ -168,22 +168,25 @@ def test_a_command_is_ahead_by_the_lag_of_damping_and_inertia(arm):
         np.testing.assert_allclose(told.arm_command_rad - told.qpos_rad, lag_nm / gains, atol=1e-4)
 
 
-def test_blended_motions_add_up(arm):
-    """A blend shortens the plan by its length, and every joint still stops at the last waypoint within its limits."""
+@pytest.mark.parametrize("blend_steps", [0, 10, 1000])
+@pytest.mark.parametrize("sizes_rad", [(0.3, 0.1), (0.1, 0.3)])
+def test_blended_motions_add_up(arm, sizes_rad, blend_steps):
+    """Each as one alone, whichever is longer; the next begins so many steps before the end, at most with it."""
     start = np.array(HOME_QPOS_RAD)
-    via = start + 0.3
-    end = via - np.array((0.3, -0.2, 0.1, 0.0, 0.2, 0.1, -0.3))
-    stopping, blended = (
-        planned(arm, start, Waypoint("via", via, 0.03, blend_s=blend_s), Waypoint("end", end, 0.01))
-        for blend_s in (0.0, 10 * TIMESTEP_S)
-    )
-    assert len(blended.opening_m) == len(stopping.opening_m) - 10
-    for each in (stopping, blended):
-        np.testing.assert_allclose(each.qpos_rad[-1], end, atol=1e-12)
-        np.testing.assert_allclose(each.arm_command_rad[-1], end, atol=1e-12)
-        assert each.opening_m[-1] == pytest.approx(0.01)
-        speed_rad_s = np.abs(np.diff(np.vstack([start, each.qpos_rad]), axis=0)) / TIMESTEP_S
-        assert (speed_rad_s <= SPEED_SHARE * arm.speed_limit_rad_s + 1e-9).all()
-    at_via = stopping.last_step["via"]
-    np.testing.assert_allclose(stopping.qpos_rad[at_via], via)
-    assert np.abs(blended.qpos_rad[at_via] - via).max() > 1e-4  # it did not stop there
+    via = start + sizes_rad[0]
+    end = via + sizes_rad[1] * np.array((-1.0, -0.7, 0.3, 0.0, 0.7, 0.3, -1.0))
+    one, other = planned(arm, start, Waypoint("", via, 0.03)), planned(arm, via, Waypoint("", end, 0.0))
+    both = planned(arm, start, Waypoint("via", via, 0.03, blend_s=blend_steps * TIMESTEP_S), Waypoint("end", end, 0.01))
+    firsts = 0, max(0, len(one.opening_m) - blend_steps)
+    lasts = [first + len(each.opening_m) - 1 for first, each in zip(firsts, (one, other), strict=True)]
+    assert both.last_step == {"via": lasts[0], "end": lasts[1]}
+    for name, begins in (("qpos_rad", (start, via)), ("arm_command_rad", (start, via)), ("opening_m", (0.02, 0.02))):
+        added = np.zeros((max(lasts) + 1, *np.shape(begins[0]))) + begins[0]
+        for each, begin, first, last in zip((one, other), begins, firsts, lasts, strict=True):
+            moved = getattr(each, name) - begin
+            added[first : last + 1] += moved
+            added[last + 1 :] += moved[-1]
+        np.testing.assert_allclose(getattr(both, name), added, atol=1e-12)
+    np.testing.assert_allclose((both.qpos_rad[-1], both.arm_command_rad[-1]), (end, end), atol=1e-12)
+    speed_rad_s = np.abs(np.diff(np.vstack([start, both.qpos_rad]), axis=0)) / TIMESTEP_S
+    assert blend_steps > 10 or (speed_rad_s <= SPEED_SHARE * arm.speed_limit_rad_s + 1e-9).all()

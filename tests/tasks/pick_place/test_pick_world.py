@@ -63,6 +63,26 @@ def test_what_cannot_be_picked_is_a_fault(world, index, moved_m, angle_deg, prob
     assert result.fault.startswith(f"the {OBJECTS[index].name} is {problem}") and result.sim_time_s == 0.0
 
 
+FAR_M = np.array([1.3, 0.2, 0.1])
+
+
+@pytest.mark.parametrize(
+    ("motion", "arguments", "words"),
+    [
+        ("place", {"index": 1, "noise": (0.8, 0.0, 0.0)}, "the car cannot be put there"),
+        ("hand_over", {"index": 1, "palm_m": FAR_M}, "the car cannot be put there"),
+        ("visit", {"held": 1, "place_m": FAR_M}, "there is no reaching out"),
+    ],
+)
+def test_what_is_held_is_kept_where_there_is_no_reach(world, motion, arguments, words):
+    world.place((0, 1, 0, 0), rng())
+    before = world.data.qpos.copy(), world.data.ctrl.copy()
+    result = getattr(world.executor, motion)(**arguments)
+    assert result.fault.startswith(f"{words}: The gripper cannot reach [1.") and result.sim_time_s == 0.0
+    for array, then in zip((world.data.qpos, world.data.ctrl), before, strict=True):
+        np.testing.assert_allclose(array, then, atol=1e-9)
+
+
 # --- acting ------------------------------------------------------------------------------------------------------
 
 
