@@ -17,6 +17,7 @@ from imagine_bench.tasks.arrows.world import ArrowWorld
 from imagine_bench.tasks.rendering import Renderer
 from imagine_bench.tasks.rendering.cameras import human_camera_view
 from imagine_bench.tasks.scenes.appearance import appearance
+from imagine_bench.tasks.scenes.constants import ARM_GROUP
 from worlds import WORLDS
 
 import imagine_bench  # noqa: F401  (registers the environments)
