@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import copy
 import math
 from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -53,8 +54,10 @@ class Reading:
 
 
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
-_ASLEEP = ("body_awake", "body_awake_ind", "dof_awake_ind", "parent_awake_ind", "tree_asleep", "tree_awake")
-_N_AWAKE = ("nbody_awake", "nparent_awake", "ntree_awake", "nv_awake")
+_SLEEP = (
+    *("body_awake", "body_awake_ind", "dof_awake_ind", "parent_awake_ind", "tree_asleep", "tree_awake"),
+    *("nbody_awake", "nparent_awake", "ntree_awake", "nv_awake"),
+)
 """Arrays and numbers of ``mjData`` that say which bodies sleep: they decide the next steps, and no state has them."""
 Sleep = Mapping[str, Ints | int]
 
@@ -178,15 +181,11 @@ class World(abc.ABC):
         self._set_sleep(state.sleep)
 
     def _sleep(self) -> Sleep:
-        counts = {name: int(getattr(self.data, name)) for name in _N_AWAKE}
-        return {name: getattr(self.data, name).copy() for name in _ASLEEP} | counts
+        return {name: copy.copy(getattr(self.data, name)) for name in _SLEEP}
 
     def _set_sleep(self, sleep: Sleep) -> None:
         for name, value in sleep.items():
-            if name in _ASLEEP:
-                getattr(self.data, name)[:] = value
-            else:
-                setattr(self.data, name, value)
+            setattr(self.data, name, value)
 
     def __getstate__(self) -> dict[str, Any]:
         """The attributes of a copy or a pickle, and the sleeping bodies: a pickled ``mjData`` forgets a part of
@@ -405,7 +404,11 @@ class World(abc.ABC):
     def update(self) -> None:
         """Bring geoms, sites, cameras and lights up to date with positions."""
         mujoco.mj_kinematics(self.model, self.data)
+        option = self.model.opt
+        flags = option.enableflags
+        option.enableflags = 0  # where bodies may sleep, MuJoCo moves cameras in the room at mj_resetData alone
         mujoco.mj_camlight(self.model, self.data)
+        option.enableflags = flags
 
     def object_poses(self) -> Floats:
         """Positions and quaternions of the objects, copied. Shape (N, 7)."""

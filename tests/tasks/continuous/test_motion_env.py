@@ -125,6 +125,22 @@ def test_parameters_of_a_world_mean_what_they_mean_of_macro_actions(family: str,
     assert not np.array_equal(seen["state"], first["state"])
 
 
+def test_a_camera_in_the_room_stands_where_this_moment_has_it() -> None:
+    """In an environment that was used before as in a new one, and after an event, while the other cubes sleep."""
+    options = {"appearance": "strong", "observation": "hand,front", "size": 32, **FREE["arrows"]}
+    used, expert = environment("arrows", **options)
+    used.reset(seed=1)
+    places = []
+    for _ in range(2):
+        places.append(used.model.camera("front").pos.copy())
+        np.testing.assert_array_equal(used.data.camera("front").xpos, places[-1])
+        carry_out(used, expert, 0)
+    assert not np.array_equal(*places)
+    again = used.reset(seed=2)[0]
+    for name, image in FAMILIES["arrows"](**options).reset(seed=2)[0].items():
+        np.testing.assert_array_equal(again[name], image, err_msg=name)
+
+
 def test_a_late_observation_is_that_of_so_many_events_ago() -> None:
     """All its parts, and it stays until the next event."""
     world = {"cubes": 1, "goal": "3", "forbid": "none"}

@@ -88,8 +88,9 @@ def test_a_noisy_expert_fails_plans_again_and_still_succeeds(monkeypatch: pytest
         begun.append(fails := len(begun) % 2 == 0)
         begin(self, macro_action, fails=fails)
 
-    monkeypatch.setattr(demonstrator.Expert, "begin", noted)
-    told = episode("noisy", 1)
+    with monkeypatch.context() as patched:
+        patched.setattr(demonstrator.Expert, "begin", noted)
+        told = episode.__wrapped__("noisy", 1)  # never kept: other tests have the expert as it is
     assert told["success"][-1] and begun == [True, False] * (len(begun) // 2)
     assert set(told["actions"][:, -1]) <= set(episode()["actions"][:, -1]), "its grip has no noise"
     assert not np.array_equal(told["actions"], episode("expert", 1)["actions"][: len(told["actions"])])
