@@ -12,7 +12,7 @@ import pytest
 from fake_codes import ACTIONS, drawn, starts
 from fake_pictures import Code, agent, picture, played, shape
 from imagine_bench_factored.factors import CodeTransition, Memory, remembering
-from imagine_bench_factored.learned import LearnedPerceptionAgent
+from imagine_bench_factored.learned import LearnedPerceptionAgent, merges
 from imagine_bench_factored.perception import FrameCodes, LearnedPerception
 from imagine_bench_factored.seeing import appearance
 from imagine_bench_factored.settings import LearnedPerceptionSettings
@@ -170,6 +170,35 @@ def test_merging_values_costs_what_they_told_of_the_next_ones() -> None:
     assert lost(true, merged[:, None]) == 0.0, "not a factor less"
     both = np.stack([merged, 2 * lamp + look], axis=1)
     assert lost(true, both) == 0.0, "another factor is split"
+    finest = 2 * place + look
+    three = lost(np.stack([finest, place, lamp], axis=1), np.stack([lamp, merged, finest], axis=1))
+    assert three == pytest.approx(told - left), "merged from the coarsest factor that tells it"
+
+
+def test_values_tried_with_different_actions_lose_nothing_by_merging() -> None:
+    """To the bit, however they are numbered: rounding decides nothing."""
+    rng = np.random.default_rng(0)
+    actions, after = rng.integers(9, size=(2, 200))
+    for _ in range(100):
+        finer, coarser = rng.permutation(9)[actions], np.zeros(200, dtype=np.int64)
+        assert appearance.lost_by_merging(*(each[:, None] for each in (finer, coarser)), actions, after[:, None]) == 0.0
+
+
+@pytest.mark.parametrize("unclear", ["code_is_clear", "following_is_clear"])
+def test_only_clear_transitions_tell_whether_values_are_merged(unclear: str) -> None:
+    """A wheel of three places that an action turns; the last row alone says that one place has two names."""
+    places = np.arange(31) % 3
+
+    def rows(values: NDArray[np.int64]) -> list[CodeTransition]:
+        return [CodeTransition((a,), 0, (b,), -1.0, terminated=False) for a, b in pairwise(values.tolist())]
+
+    earlier, present = rows(places), rows(np.minimum(places, 1))
+    odd = earlier[0]._replace(code=(1,), following=(0,)), present[0]._replace(code=(0,), following=(1,))
+    assert merges(earlier, present) and not merges(present, earlier) and not merges([], [])
+    assert not merges([*earlier, odd[0]], [*present, odd[1]])
+    for side in (0, 1):
+        last = [row._replace(**{unclear: place != side}) for place, row in enumerate(odd)]
+        assert merges([*earlier, last[0]], [*present, last[1]])
 
 
 def test_what_changes_only_between_episodes_is_a_factor_too() -> None:

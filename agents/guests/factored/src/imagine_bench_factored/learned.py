@@ -90,8 +90,8 @@ class LearnedPerceptionAgent(CodeAgent):
     def _recode(self, frame_factors: FrameFactors, found_in: int) -> None:
         """Give every replayed transition the codes that its frames have now, and learn from all of them once more.
 
-        The factors seen before are kept where outcomes contradict the present factors and did not contradict those,
-        and where the present factors tell fewer values apart and so predict worse.
+        The factors seen before are kept where outcomes contradict the present factors, and where these merge values
+        that were told apart and so predict worse; unless outcomes contradict those seen before, too.
         """
         perception = self.perception
         count = len(self.replay)
@@ -103,7 +103,7 @@ class LearnedPerceptionAgent(CodeAgent):
             found_now_in = perception.found_in
             perception.take(frame_factors, found_in)
             earlier = self._rows()
-            worse = _contradictions(rows[of_task]) > few or _merges(earlier, rows)
+            worse = _contradictions(rows[of_task]) > few or merges(earlier, rows)
             if worse and _contradictions(earlier[of_task]) <= few:
                 rows = earlier
             else:
@@ -167,8 +167,11 @@ def _contradictions(rows: Sequence[CodeTransition]) -> int:
     return contradictions(reward_classes(rows).of(rows))
 
 
-def _merges(earlier: Sequence[CodeTransition], present: Sequence[CodeTransition]) -> bool:
-    """Whether the present codes of the same transitions merge values of earlier ones and so predict worse."""
+def merges(earlier: Sequence[CodeTransition], present: Sequence[CodeTransition]) -> bool:
+    """Whether the present codes of the same transitions merge values of earlier ones and so predict worse.
+
+    Only transitions that are clear in both tell.
+    """
     clear = [(was, now) for was, now in zip(earlier, present, strict=True) if was.is_clear and now.is_clear]
     if not clear:
         return False

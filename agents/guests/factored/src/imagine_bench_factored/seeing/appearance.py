@@ -45,6 +45,7 @@ _SAME = 0.15  # distance that jitter makes; the least distance of two values
 _OTHER = 0.2
 _ROUND = 0.05  # added to heights where gaps are compared by their ratio
 _EVIDENCE = 10.0  # how much more likely, as a logarithm, finer values must make the next values
+_DIGITS = 9  # of that logarithm, behind the point, that are no rounding
 _EXEMPLARS = 6  # most crops a value that are kept
 _COMPARED = 160  # most crops a factor that are grouped; the others take the value of the most alike
 _TOGETHER = 0.45  # share of the changes of either of two neighbouring pixels of a region that are changes of both
@@ -426,7 +427,8 @@ def lost_by_merging(finer: Codes, coarser: Codes, actions: Ints, following: Code
     """How much likelier ``finer`` codes (N, P) than ``coarser`` ones (N, P) make the next coarser ones (N, P).
 
     That is :func:`follows`, summed over the factors in which values are merged. 0 unless each factor of the coarser
-    codes is one of the finer codes, but for the numbers of its values, or merges values of one.
+    codes is one of the finer codes, but for the numbers of its values, or merges values of one. It is rounded, so that
+    values that tell as much as merged ones lose nothing.
     """
     lost = 0.0
     for values, after in zip(coarser.T, following.T, strict=True):
@@ -436,7 +438,7 @@ def lost_by_merging(finer: Codes, coarser: Codes, actions: Ints, following: Code
         one = min(of, key=lambda each: len(np.unique(each)))
         if not _tells(values, one):
             lost += follows(one, actions, after) - follows(values, actions, after)
-    return lost
+    return round(lost, _DIGITS)
 
 
 def _tells(one: Ints, other: Ints) -> bool:
