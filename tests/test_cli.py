@@ -217,6 +217,8 @@ def test_seeds_are_added_until_it_is_decided_or_there_are_enough(
     assert sorted(inline.order) == sorted(
         [*((agent, seed) for agent in few["agents"] for seed in (0, 1)), ("table", 2), ("imaginer", 2)]
     )
+    protocols = [job.spec.protocol for job in inline.jobs]
+    assert {(one.budgets, one.evaluation_episodes, one.execution) for one in protocols} == {((2,), 2, "kinematic")}
     printed = capsys.readouterr().out
     (report,) = re.findall(r"Report: +(\S+)", printed)
     assert "merged-" in report
