@@ -69,6 +69,17 @@ def test_headlines_are_corrected_for_one_another_and_for_all_looks(tmp_path: Pat
     assert found[1] < found[4] and needed[1] < needed[4]
 
 
+def test_a_bench_is_decided_once_all_of_its_headlines_are(tmp_path: Path) -> None:
+    for behind in (("dqn",), ("dqn_more_updates",), ("dqn", "dqn_more_updates")):
+
+        def change(run: RunResult, row: Checkpoint, behind: tuple[str, ...] = behind) -> Checkpoint:
+            return dataclasses.replace(row, successes=160 - 60 * (run.agent in behind) + 12 * (run.seed % 3))
+
+        result = rewritten(bench_result(tmp_path / "-".join(behind), protocol=FIRST), change)
+        assert [each.decided for each in headlines(result)] == [base in behind for _, base in PAIRS]
+        assert decided(result) == (len(behind) == 2)
+
+
 @pytest.fixture
 def staged(tmp_path: Path) -> Callable[[int, list[Protocol]], Callable[..., BenchResult]]:
     """A function that stands for running benches, of imagination so many tests ahead; it notes their protocols."""

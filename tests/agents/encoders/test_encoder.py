@@ -88,6 +88,10 @@ def test_strip_loss_is_gaussian_and_summed_over_pixels() -> None:
     expected = -pixels.log_prob(vae.target(batch)).sum(dim=(1, 2, 3)).mean() - constant
     torch.testing.assert_close(terms.reconstruction, expected, rtol=1e-4, atol=1e-2)
     torch.testing.assert_close(terms.loss, expected + 2.0 * kl_from_standard_normal(mu, log_variance).mean())
+    noise = torch.randn(5, 24, generator=torch.Generator().manual_seed(0))
+    drawn = torch.distributions.Normal(mu, (0.5 * log_variance).exp()).icdf(torch.special.ndtr(noise))
+    expected = vae.log_loss(vae.generate(drawn), vae.target(batch)).mean()
+    torch.testing.assert_close(vae.elbo(batch, noise, beta=2.0).reconstruction, expected, rtol=1e-4, atol=1e-2)
     swapped, _ = vae.posterior(batch.flip(1))
     apart = mu.view(5, 3, 8)
     torch.testing.assert_close(apart.flip(1), swapped.view(5, 3, 8), msg="strips share weights")

@@ -62,10 +62,12 @@ for job in pickle.load(sys.stdin.buffer):
 def test_what_a_run_prints_is_in_its_own_log(tmp_path: Path) -> None:
     """Also where a process carries out several, and keeps lines back."""
     jobs = [job(tmp_path, "random", seed) for seed in (0, 1)]
+    jobs[0].log.parent.mkdir(parents=True)
+    jobs[0].log.write_text("said by an earlier try\n")
     environment = {**os.environ, "PYTHONPATH": str(_HERE), "PYTHONUNBUFFERED": ""}
     subprocess.run([sys.executable, "-c", _PRINTS], input=pickle.dumps(jobs), env=environment, check=True)
     said = [[line for line in each.log.read_text().splitlines() if line.startswith("said")] for each in jobs]
-    assert said == [["said by 0"], ["said by 1"]]
+    assert said == [["said by an earlier try", "said by 0"], ["said by 1"]]
 
 
 def test_an_observer_that_fails_is_not_taken_for_a_run_that_did(tmp_path: Path) -> None:
