@@ -170,3 +170,13 @@ def test_the_novelty_of_a_frame_is_between_0_and_1() -> None:
         else:
             assert found is not None and len(found) == ACTIONS
             assert 0.0 < found.min() < found.max() <= 1.0
+
+
+@pytest.mark.parametrize("predicts_with", ["average", "network", "sample"])
+def test_confidence_is_that_of_weight_samples_whatever_predicts(predicts_with: str) -> None:
+    """Also of an agent without a filter, which compares weight samples for nothing else."""
+    uses = {"imagination.confidence_scale": 0.1, "imagination.predicts_with": predicts_with}
+    agent = built(imagination_agents.make, uses)
+    live(agent, range(6), np.random.default_rng(0))
+    weights = agent.imagination.memory.arrays()["weight"]
+    assert len(weights) and 0.0 < weights.min() and weights.max() < 1.0
