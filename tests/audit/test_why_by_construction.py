@@ -67,6 +67,13 @@ def test_one_flaw_is_the_cause_of_every_failure(agent: str, cause: str, task: st
         assert set(found.causes.values()) == {cause} and len(found.causes) > 12
 
 
+def test_what_is_misread_in_the_appearance_of_tests_alone_is_misread(tmp_path: Path) -> None:
+    row, found = asked(tmp_path, "dazzled", CUBES, test_appearance="noise=1")
+    assert set(found.causes.values()) == {"misread"} and row.successes == 0
+    row, found = asked(tmp_path / "clean", "dazzled", CUBES)
+    assert not found.causes and row.successes == 24
+
+
 def test_grasps_that_slip_are_the_cause_of_every_failure(tmp_path: Path) -> None:
     """In contact physics, where the planner takes cubes to be elsewhere."""
     changes: dict[str, Any] = {"execution": "physics", "physics": (("plan_error_mm", 30.0),), "budgets": (1,)}

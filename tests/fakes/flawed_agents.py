@@ -138,6 +138,16 @@ class HalfBlind(Blind):
         return read
 
 
+class Dazzled(Blind):
+    """Misreads gestures in noise alone."""
+
+    def read_frames(self, frames: Frame) -> NDArray[np.int64]:
+        read, n_gestures = super().read_frames(frames), self.states[:, -1].max() + 1
+        clean = np.array([np.abs(self.frames - frame.ravel()).mean(axis=1).min() < 8.0 for frame in frames])
+        read[:, -1] = np.where(clean, (read[:, -1] - 1) % n_gestures, read[:, -1])
+        return read
+
+
 class Forgetful(Bad):
     """Plays perfectly on the first frame of an episode, and never again."""
 
@@ -154,6 +164,7 @@ class Forgetful(Bad):
 FLAWED = {
     "sound": Sound, "bad": Bad, "not_greedy": NotGreedy, "wrong_model": WrongModel, "timid": Timid,
     "timid_modeller": TimidModeller, "blind": Blind, "half_blind": HalfBlind,
+    "dazzled": Dazzled,
     "forgetful": Forgetful,
 }  # fmt: skip
 for name, kind in FLAWED.items():
