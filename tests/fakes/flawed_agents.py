@@ -143,7 +143,7 @@ class Dazzled(Blind):
 
     def read_frames(self, frames: Frame) -> NDArray[np.int64]:
         read, n_gestures = super().read_frames(frames), self.states[:, -1].max() + 1
-        clean = np.array([np.abs(self.frames - frame.ravel()).mean(axis=1).min() < 8.0 for frame in frames])
+        clean = np.array([np.abs(self.frames - frame.ravel()).mean(axis=1).min() < 12.0 for frame in frames])
         read[:, -1] = np.where(clean, (read[:, -1] - 1) % n_gestures, read[:, -1])
         return read
 

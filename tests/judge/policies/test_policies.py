@@ -222,6 +222,18 @@ def test_the_search_for_exploits_begins_with_the_given_policies() -> None:
         assert starts @ (found.believed - found.real) == pytest.approx(overrating)
 
 
+def test_the_largest_exploit_is_that_from_the_starts() -> None:
+    """The first policy is overrated most where no start leads to, by 10 a macro-action; from the start, by 2 in all."""
+    onward = np.zeros((3, 2, 3))
+    onward[0, 0, 1] = onward[0, 1, 0] = onward[2, :, 2] = 1.0
+    model = DenseModel(onward, np.array([[0.0, 1.0], [0.0, 5.0], [10.0, 0.0]]))
+    truth = DenseModel(onward, np.zeros((3, 2)))
+    luckless = mock.Mock(integers=lambda high, size: np.ones(size, dtype=np.int64))
+    policies = np.eye(2)[[[1, 0, 0], [0, 1, 1]]]
+    found = largest_exploit(model, truth, np.array([1.0, 0.0, 0.0]), policies, 2, luckless)
+    assert (found.believed - found.real)[0] == 5.0
+
+
 @pytest.mark.parametrize(("reached", "over", "steps"), [((1,), False, 3), ((1,), True, 1), ((7,), False, 1)])
 def test_a_course_ends_with_the_episode_the_plan_or_the_known_world(reached: State, over: bool, steps: int) -> None:
     plan = np.zeros((3, 2), dtype=np.int64)
@@ -271,6 +283,12 @@ def test_agents_that_train_in_the_truth_are_as_good_as_its_best_plan(task: str) 
         policies = trained(world.truth, np.random.default_rng(0), episodes)
         returns = values_of(world.dense_truth, policies, world.horizon) @ world.starts
         assert len(returns) == AGENTS and returns.mean() == pytest.approx(best, abs=0.1)
+
+
+def test_imagined_episodes_begin_anew_at_the_horizon() -> None:
+    """Three macrostates that nothing leaves, and no end: only new episodes let agents learn of all."""
+    endless = Model(np.tile(np.arange(3)[:, None, None], (1, 2, 1)), np.ones((3, 2, 1)), np.tile([0.0, 1.0], (3, 1)))
+    assert trained(endless, np.random.default_rng(0), (np.full(3, 1.0 / 3.0), 4))[..., 1].all()
 
 
 def test_an_agent_on_data_tries_nothing_else() -> None:
