@@ -334,6 +334,19 @@ def test_the_value_of_a_filter_is_the_cost_of_mistakes() -> None:
     assert scores["value_of_filter"] == pytest.approx(scores["value_loss"]) and scores["value_loss"] > 1.0
     assert scores["value_of_abstaining"] == pytest.approx(scores["value_of_filter"])
 
+    few = set(sorted(ends)[: len(set(world.one_step.pairs)) // 20])  # what is best is next in its doubts
+    best = {(state, world.spec.rules.optimal_action(state)) for state, _ in world.one_step.pairs}
+
+    def doubtful(right: Imagined, frames: Frame, actions: Ints) -> Imagined:
+        found = mistaken(world, few).alter(right, frames, actions)
+        doubts = [2.0 * (pair in few) + (pair in best) for pair in asked_pairs(world, frames, actions)]
+        assert found.epistemic is not None
+        noise = np.random.default_rng(0).random(len(frames))
+        return dataclasses.replace(found, epistemic=np.broadcast_to((doubts + noise)[:, None], found.epistemic.shape))
+
+    scores = world.scores(Altered(world, doubtful))
+    assert scores["value_of_abstaining"] > 0.9 * scores["value_loss"] > 0.0
+
     def half(right: Imagined, frames: Frame, actions: Ints) -> Imagined:
         """Its filter keeps the first frame of each macrostate."""
         found = mistaken(world, ends).alter(right, frames, actions)

@@ -128,20 +128,21 @@ def test_the_example_is_exact(program: Program) -> None:
 
 
 class Elsewhere(SymbolRules):
-    """The rules, but with a probability of 0.8 the next symbols are others."""
+    """The rules, but with some probability the next symbols are others."""
 
-    def __init__(self, spec: TaskSpec, elsewhere: State) -> None:
+    def __init__(self, spec: TaskSpec, elsewhere: State, share: float = 0.8) -> None:
         super().__init__(spec.n_actions)
         self._rules = spec.rules
         self._elsewhere = elsewhere
+        self._share = share
 
     def outcomes(self, macrostate: State, action: int) -> tuple[Outcome, ...]:
-        right = [replace(each, probability=0.2) for each in self._rules.outcomes(macrostate, action)]
-        return (*right, Outcome(0.8, self._elsewhere, -1.0, terminated=False, success=False))
+        right = [replace(each, probability=1.0 - self._share) for each in self._rules.outcomes(macrostate, action)]
+        return (*right, Outcome(self._share, self._elsewhere, -1.0, terminated=False, success=False))
 
 
 def test_only_macrostates_of_the_world_are_distractors() -> None:
-    """Nothing else can be drawn, however probable it is. Of 164 others, five are drawn and one is more probable."""
+    """Nothing else can be drawn, however probable it is. Of 164 others, five are drawn and one is no less probable."""
     spec = registry.task("arrow_puzzle")
     for outside in ((-1, -1, -1, -1), (0, 0, 0, 0)):
         assert score(Elsewhere(spec, outside), spec).ranking == 1.0
@@ -149,7 +150,8 @@ def test_only_macrostates_of_the_world_are_distractors() -> None:
     reached = sum(each.macrostate == start for pair in pairs_of_play(spec) for each in spec.rules.outcomes(*pair))
     unreached = 1.0 - reached / len(pairs_of_play(spec))
     expected = unreached * (1.0 - 5 / 164) + (1.0 - unreached)
-    assert score(Elsewhere(spec, start), spec).ranking == pytest.approx(expected, abs=1e-12)
+    for share, ranking in ((0.8, expected), (0.5, expected), (0.4, 1.0)):
+        assert score(Elsewhere(spec, start, share), spec).ranking == pytest.approx(ranking, abs=1e-12)
 
 
 def pairs_of_play(spec: TaskSpec) -> list[tuple[State, int]]:
