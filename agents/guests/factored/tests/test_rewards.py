@@ -46,9 +46,13 @@ def test_exact_rewards_have_no_classes_and_stay_as_they_are(outcomes: Sequence[t
 
 @pytest.mark.parametrize(("std", "step"), [(0.5, 0.0), (0.0, 0.5), (0.5, 0.5), (1.0, 0.0)])
 def test_noisy_rewards_have_the_classes_of_the_rules(std: float, step: float) -> None:
-    found = reward_classes(rows(200, std=std, step=step))
+    noisy, exact = rows(200, std=std, step=step), rows(200)
+    found = reward_classes(noisy)
     assert found.centers[False] == pytest.approx([-1.0], abs=0.25)
     assert found.centers[True] == pytest.approx([-5.0, 50.0], abs=0.4)
+    for center in (*found.centers[False], *found.centers[True]):
+        of_class = [row.reward for row, ruled in zip(noisy, exact, strict=True) if abs(ruled.reward - center) < 1.0]
+        assert center == pytest.approx(np.mean(of_class)), "each sighting counts"
     new = CodeTransition((99,), 0, (98,), 49.0, True)
     assert found.reward(new) == found.centers[True][1]
     assert found.reward(new._replace(reward=20.0)) == 20.0, "it is like none that was seen"
