@@ -10,15 +10,22 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
+import torch
 from imagine_bench_programs import __main__ as commands
 from imagine_bench_programs.experience import macro_actions_of, play, write_experience
 from imagine_bench_programs.model import make_program
 from imagine_bench_programs.program import Program, spelled
 from imagine_bench_programs.scores import efficiency, score
 from imagine_bench_programs.symbol_rules import SymbolRules
+from imagine_bench_programs.symbols import Symbols
+from numpy.typing import NDArray
+from torch import Tensor
 
 from imagine_bench import bench, registry
 from imagine_bench.cli import exit_code as main
@@ -339,3 +346,24 @@ def test_experience_is_as_late_and_hidden_as_frames() -> None:
         states.append(outcome.macrostate)
         assert (row.reward, row.ended) == (outcome.reward, outcome.terminated)
         assert row.now == states[max(0, row.step - 2)] and row.then == states[max(0, row.step - 1)]
+
+
+class TwoShown:
+    """An encoder of one factor of two values, which its probe reads as two of three macrostates."""
+
+    card = SimpleNamespace(code_sizes=(2,), cardinalities=(3,))
+
+    def read_macrostate(self, hot: Tensor) -> NDArray[np.int64]:
+        return hot.argmax(dim=1, keepdim=True).numpy()
+
+    def decode(self, hot: Tensor) -> NDArray[np.float32]:
+        return (0.25 + 0.5 * hot.argmax(dim=1)[:, None, None]).numpy() * np.ones((1, 64, 64), dtype=np.float32)
+
+
+@pytest.mark.parametrize(("kind", "shown"), [("macrostates", [64, 191, 0]), ("codes", [64, 191])])
+def test_a_macrostate_that_no_code_shows_is_black(kind: str, shown: list[int]) -> None:
+    context: Any = SimpleNamespace(device=torch.device("cpu"))
+    with mock.patch("imagine_bench_programs.symbols.load_perception", return_value=SimpleNamespace(encoder=TwoShown())):
+        symbols = Symbols(context, kind)
+    images = symbols.images([(value,) for value in range(len(shown))])
+    assert images[:, 0, 0].tolist() == images[:, -1, -1].tolist() == shown
