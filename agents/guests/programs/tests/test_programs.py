@@ -16,7 +16,6 @@ from unittest import mock
 
 import numpy as np
 import pytest
-import torch
 from imagine_bench_programs import __main__ as commands
 from imagine_bench_programs.experience import macro_actions_of, play, write_experience
 from imagine_bench_programs.model import make_program
@@ -362,7 +361,7 @@ class TwoShown:
 
 @pytest.mark.parametrize(("kind", "shown"), [("macrostates", [64, 191, 0]), ("codes", [64, 191])])
 def test_a_macrostate_that_no_code_shows_is_black(kind: str, shown: list[int]) -> None:
-    context: Any = SimpleNamespace(device=torch.device("cpu"))
+    context: Any = SimpleNamespace(device="cpu")
     with mock.patch("imagine_bench_programs.symbols.load_perception", return_value=SimpleNamespace(encoder=TwoShown())):
         symbols = Symbols(context, kind)
     images = symbols.images([(value,) for value in range(len(shown))])
