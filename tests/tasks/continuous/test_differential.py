@@ -18,7 +18,7 @@ POSTURE_COST = 0.005 * np.array([1.0] * 6 + [0.1])
 """Square roots of the weights of the posture term."""
 
 
-@pytest.mark.parametrize("share", [0.1, 1.0])
+@pytest.mark.parametrize("share", [0.1, 0.3, 1.0])
 def test_a_step_within_limits_misses_the_motion_by_least_squares(share: float) -> None:
     """Metres count once and radians 0.3 times; a step that misses by more than 2 mm is held up.
 
@@ -52,7 +52,7 @@ def test_a_step_within_limits_misses_the_motion_by_least_squares(share: float) -
         missed_m = np.linalg.norm(weights * (jacobian @ step_rad - motion))
         assert limited == (missed_m > 2e-3)
         held_up.append(limited)
-    assert np.mean(held_up) > 0.5 if share == 1.0 else np.mean(held_up) < 0.5
+    assert np.mean(held_up) > 0.5 if share > 0.2 else np.mean(held_up) < 0.5
 
 
 @pytest.mark.parametrize("axis", range(3))
