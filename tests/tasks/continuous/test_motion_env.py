@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from by_hand import FAMILIES, FREE, STARTS, carry_out, environment
 from imagine_bench.tasks.continuous.controls import CONTROL_NAMES, WORKSPACE_HIGH_M, WORKSPACE_LOW_M
+from imagine_bench.tasks.continuous.dense import Potential
 from imagine_bench.tasks.continuous.env import MotionEnv
 from imagine_bench.tasks.continuous.expert import Expert
 from imagine_bench.tasks.continuous.instructions import instruction
@@ -201,6 +202,7 @@ def test_dense_rewards_sum_to_sparse_ones_less_the_potential(family: str) -> Non
     for env in (dense, sparse):
         env.reset(seed=2, options={"macrostate": {"arrows": (1, 2, 0, 1), "pick_place": (0, 0, 0, 1)}[family]})
     begun = dense.episode.potential
+    standing = Potential(dense.world, dense.task.rules)
     assert begun < 0
     paid = np.zeros(2)
     over = False
@@ -211,6 +213,8 @@ def test_dense_rewards_sum_to_sparse_ones_less_the_potential(family: str) -> Non
             action = expert.act()
             (_, shaped, *_), (_, reward, over, *_) = dense.step(action), sparse.step(action)
             paid += shaped, reward
+            dense.world.update()
+            assert over or dense.episode.potential == pytest.approx(standing(dense.episode.macrostate), abs=1e-9)
             if dense.episode.events == 0:
                 early = max(early, paid[0])
     assert paid[0] == pytest.approx(paid[1] - begun, abs=1e-9)
