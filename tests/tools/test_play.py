@@ -318,6 +318,33 @@ def test_two_keys_at_once_do_what_both_do():
         np.testing.assert_array_equal(commands[one, other], commands[one,] + commands[other,])
 
 
+class Told(gymnasium.Wrapper):
+    """Says something else of each period."""
+
+    def __init__(self, env, told):
+        super().__init__(env)
+        self.told = told
+
+    def step(self, action):
+        *rest, info = self.env.step(action)
+        return *rest, {**info, **self.told}
+
+
+@pytest.mark.parametrize("event", [True, False])
+def test_an_event_is_said_also_where_the_hand_is_held_up(event):
+    """So the limit changes nothing on the screen then; in any other period it does."""
+    env = gymnasium.make("imagine_bench/ArrowPuzzleEasyMotion-v0", disable_env_checker=True, size=32)
+    images = []
+    for limited in ("", "workspace"):
+        told = {"event": event, "macro_action": 1, "limited": limited}
+        game = HandGame(Told(env, told), registry.task("arrow_puzzle_easy"), 0)
+        game.reset()
+        game.step(np.zeros(7, np.float32))
+        images.append(game.render())
+    env.close()
+    assert np.array_equal(*images) == event
+
+
 def test_a_press_closes_the_fingers_and_the_end_stands_still(hand):
     game = hand
     game.reset()
