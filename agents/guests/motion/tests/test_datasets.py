@@ -13,6 +13,7 @@ import minari
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from imagine_bench.tasks.continuous.instructions import instruction
 from imagine_bench_motion.control import datasets, demonstrator
 from imagine_bench_motion.control.datasets import (
     DemonstrationSettings,
@@ -77,6 +78,16 @@ def test_the_expert_solves_its_episodes_and_names_its_action() -> None:
         assert after in (before, rules.outcomes(before, macro_action)[0].macrostate)
     assert len(set(states)) > 1
     assert told["instruction"][0].startswith("Turn the")
+
+
+def test_each_command_has_the_wish_of_the_moment_before_it() -> None:
+    """In a world where the human may want something else after each macro-action."""
+    spec = registry.task("arrows:cubes=2,goal_change=0.9")
+    found = [episode(index=index, task="arrows:cubes=2,goal_change=0.9") for index in range(3)]
+    for told in found:
+        states = [tuple(state) for state in told["macrostates"].tolist()]
+        assert told["instruction"].tolist() == [instruction(spec, state) for state in states[:-1]]
+    assert any(len(set(told["instruction"].tolist())) > 1 for told in found)
 
 
 def test_a_noisy_expert_fails_plans_again_and_still_succeeds(monkeypatch: pytest.MonkeyPatch) -> None:
