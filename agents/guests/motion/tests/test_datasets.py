@@ -82,8 +82,8 @@ def test_the_expert_solves_its_episodes_and_names_its_action() -> None:
 
 def test_each_command_has_the_wish_of_the_moment_before_it() -> None:
     """In a world where the human may want something else after each macro-action."""
-    spec = registry.task("arrows:cubes=2,goal_change=0.9")
-    found = [episode(index=index, task="arrows:cubes=2,goal_change=0.9") for index in range(3)]
+    spec = registry.task("arrows:cubes=3,goal_change=0.9")
+    found = [episode(index=index, task="arrows:cubes=3,goal_change=0.9") for index in range(9)]
     for told in found:
         states = [tuple(state) for state in told["macrostates"].tolist()]
         assert told["instruction"].tolist() == [instruction(spec, state) for state in states[:-1]]
