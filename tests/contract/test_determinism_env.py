@@ -351,3 +351,24 @@ def test_memory_stays_flat_over_resets(task):
     before_mb, after_mb = map(float, done.stdout.split())
     assert after_mb < 300
     assert after_mb - before_mb < 4
+
+
+def test_a_state_brings_the_people_that_stood_by_its_motion():
+    """Also to an environment whose own people stood elsewhere; they move on when the motion is over."""
+    one, other = (
+        gymnasium.make("imagine_bench/Arrows-v0", disable_env_checker=True, goal_change=1.0).unwrapped for _ in "ab"
+    )
+    one.capture_motion_hz = other.capture_motion_hz = 10.0
+    moved = []
+    for seed in range(3):
+        one.reset(seed=seed)
+        one.step(seed)
+        other.reset(seed=seed + 30)
+        other.set_state(one.get_state())
+        motions = [env.motion() for env in (one, other)]
+        np.testing.assert_array_equal(*[motion.poses_in_world for motion in motions])
+        np.testing.assert_array_equal(*[motion.time_s for motion in motions])
+        moved.append(not np.array_equal(*motions[0].poses_in_world[-2:]))
+    assert any(moved)
+    one.close()
+    other.close()
