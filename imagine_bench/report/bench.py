@@ -400,7 +400,7 @@ def cost(data: ReportData) -> Section:
 def success_figure(data: ReportData) -> Figure:
     """Success (%) by real training episodes, with 95 % intervals, chance level, optimum and the thesis' points."""
     agents = data.result.protocol.agents
-    ticks = set(data.result.protocol.budgets)
+    ticks = sorted(data.result.protocol.budgets)
     curves = {}
     for agent in agents:
         rows = data.of(agent)
@@ -418,8 +418,11 @@ def success_figure(data: ReportData) -> Figure:
             means, stds = 100.0 * np.array([by_budget[budget] for budget in near]).T
             axes.errorbar(near, means, stds, fmt="D:", color=figures.color(agent), fillstyle="none", linewidth=1.0)
     axes.set_xscale("log")
-    crowded = {tick for tick in ticks if any(tick < more < 1.25 * tick for more in ticks)}
-    axes.set_xticks(sorted(ticks), ["" if tick in crowded else f"{tick:,}" for tick in sorted(ticks)])
+    labels: dict[int, str] = {}
+    for tick in reversed(ticks):
+        if 1.25 * tick <= min(labels, default=np.inf):
+            labels[tick] = f"{tick:,}"
+    axes.set_xticks(ticks, [labels.get(tick, "") for tick in ticks])
     axes.minorticks_off()
     axes.set(ylabel="test episodes solved (%)", ylim=(-2, 108))
     return figure

@@ -60,6 +60,20 @@ def test_the_success_figure_draws_scores_bands_and_the_thesis(data: ReportData) 
     assert ticks == {800: "800", 1000: "", 1240: "1,240"}, "words that would overlap are left out"
 
 
+@pytest.mark.parametrize(
+    ("budgets", "labelled"),
+    [((30, 35, 40, 45, 50, 60, 70, 80), ["35", "45", "60", "80"]), ((100, 125, 1000), ["100", "125", "1,000"])],
+)
+def test_as_many_budgets_are_labelled_as_have_room(
+    data: ReportData, budgets: tuple[int, ...], labelled: list[str]
+) -> None:
+    """From the largest one on, each that is a fifth below the last that was labelled."""
+    result = bench_result(data.result.folder, protocol=dataclasses.replace(WIDE, budgets=budgets))
+    (axes,) = success_figure(collect(result)).axes
+    assert axes.get_xticks().tolist() == list(budgets)
+    assert [text for label in axes.get_xticklabels() if (text := label.get_text())] == labelled
+
+
 def test_the_open_loop_figure_draws_the_means_of_the_file_by_depth(data: ReportData) -> None:
     """The first macro-action that is imagined has depth 1."""
     loops = open_loop_means(data.result)
